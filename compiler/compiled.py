@@ -1,6 +1,6 @@
 """The compiled model: CasADi functions of each peer type, and the communication structure.
 
-Takes: nothing (these are the data types the stage `functions` fills and the runtime reads).
+Takes: nothing (data types, created by the stage `functions` and read by the runtime).
 Gives: `Model` and its parts: `Clock`, `Graph`, `PairDelay`, `Loss`, `Channel`, `Link`; `Formula`, `Timing`,
 `Parameter`; `State`, `Hold`, `Receive`, `ClockPartition`, `SendPartition`, `ForcePorts`, `Limit`, `Replaced`,
 `PeerType`; `PeerColumn`, `Group`; `Experiment`, `Axis`. The names of counted parameters: `PEERS`, `count_of`,
@@ -12,8 +12,8 @@ Every function of a peer type takes some of these vectors, in this order:
 
     x  (n_x,)  continuous states, in the order of `PeerType.states`
     u  (n_u,)  present outputs of the holds, in the order of `PeerType.holds`
-    m  (n_m,)  for a tick: the partition's remembered outputs from its previous tick
-    r  (n_r,)  for a tick: values received from the others, in the order of `ClockPartition.receives`
+    m  (n_m,)  for a tick: the partition's stored outputs of its previous tick
+    r  (n_r,)  for a tick: values received from other peers, in the order of `ClockPartition.receives`
     p  (n_p,)  parameters, in the order of `PeerType.parameters`
     t  ()      time in seconds
 """
@@ -31,33 +31,33 @@ from apc.compiler.cache import Origin
 
 # The units of positions: a length; an angle, or a rotation parameter of a body in space.
 LENGTH, ANGLES = "m", ("rad", "1")
-PEERS = "peers"  # the parameter that holds the number of peers
+PEERS = "peers"  # the parameter for the number of all peers
 LARGEST_COUNT = 10**9  # of peers in one group
-MOST_GROUPS = 1000  # number of peers of a model: the communication graph has an entry per pair
-MOST_PLACED = 10**6  # peers of a model on a graph that isn't complete: each has a place in several arrays
+MOST_GROUPS = 1000  # groups of a model: the communication between groups has an entry per pair
+MOST_PLACED = 10**6  # peers of a model on a graph that isn't complete: several arrays have an entry per peer
 COUNT = "count("  # prefix of the parameters that count received peers of a link, see `count_of`
 
 
 def count_of(link: str) -> str:
-    """Return the name of the parameter that is the weighted count of the peers received over a link."""
+    """Return the name of the parameter for the weighted number of peers received over a link."""
     return f"{COUNT}{link})"
 
 
 def group_count(group: str) -> str:
-    """Return the name of the parameter that holds how many peers a group has; no part can have it."""
+    """Return the name of the parameter for the number of peers of a group; no part can have this name."""
     return f"{group}.count"
 
 
 def counts_peers(parameter: str) -> bool:
-    """Return whether a parameter is a number of peers: of a group, or computed from those of groups."""
+    """Return whether a parameter is a number of peers: of a group, of the model, or received over a link."""
     return parameter == PEERS or parameter.startswith(COUNT) or parameter.endswith(".count")
 
 
 @dataclass(frozen=True, slots=True)
 class Clock:
-    """Ticks at `phase + k*period`, k = 0, 1, …; `period` and `phase` are names of timings.
+    """A clock with ticks at `phase + k*period`, k = 0, 1, …; `period` and `phase` are names of timings.
 
-    `line` and `column` are the location of its period in the topology, 0 if unknown.
+    `line` and `column` are the location of the period in the topology, 0 if unknown.
     """
 
     name: str
@@ -94,9 +94,9 @@ class PairDelay:
 class Loss:
     """The loss model of packets, netem's `gemodel` (after Gilbert and Elliott): names of four parameters.
 
-    In its good state a directed link loses a packet with the probability `one_minus_k`, in its bad state with
-    `one_minus_h`; after each packet a good one turns bad with the probability `p`, a bad one good with `r`.
-    With r = 1 − p losses are independent.
+    In its good state a directed link loses a packet with probability `one_minus_k`, in its bad state with
+    probability `one_minus_h`; after each packet a good link turns bad with probability `p`, a bad link good
+    with probability `r`. With r = 1 − p losses are independent.
     """
 
     p: str
@@ -110,10 +110,10 @@ class Channel:
     """The channel of an unreliable link; directed links are independent.
 
     `jitter` is the name of a timing, added to the delay times a number drawn from `distribution` ("uniform",
-    "normal" or "pareto"). `trace` (n,) are recorded delays in seconds instead, one per packet, infinite for a
-    lost one, repeated periodically. `reorder` selects the packet in effect: the one sent last ("newest") or
-    the one arrived last ("all"). `on_loss` is the substitute for a missing packet: the previous one ("hold")
-    or the receiver's own value of that moment ("zero": no difference, no force).
+    "normal" or "pareto"). `trace` (n,) has recorded delays in seconds instead, one per packet, infinite for a
+    lost packet, repeated periodically. `reorder` selects the packet in effect: the packet sent last
+    ("newest") or the packet that arrived last ("all"). `on_loss` is the substitute for a missing packet: the
+    previous packet ("hold") or the receiver's own present value ("zero": no difference, no force).
     """
 
     loss: Loss | None
@@ -126,10 +126,10 @@ class Channel:
 
 @dataclass(frozen=True, slots=True)
 class Link:
-    """A network link: transfers every sender's channels to the receivers.
+    """A network link, which transfers the values sent by every peer to the receivers.
 
-    `clock` is the name of a clock, `delay` of a timing; `delays` are the pairs of groups with separate
-    delays. `channel` is None for a reliable link.
+    `clock` is the name of a clock, `delay` of a timing; `delays` are the pairs of groups with other delays.
+    `channel` is None for a reliable link.
     """
 
     name: str
@@ -150,7 +150,7 @@ class Formula:
 
 @dataclass(frozen=True, slots=True)
 class Timing:
-    """A period, phase or delay: exact value in seconds; `formula` if it follows from other numbers."""
+    """A period, phase or delay: exact value in seconds; `formula` if it depends on other numbers."""
 
     name: str
     value: Fraction
@@ -158,7 +158,7 @@ class Timing:
 
     @property
     def number(self) -> Fraction:
-        """The value, exact, as a parameter has it."""
+        """The exact value, by the same name as in `Parameter`."""
         return self.value
 
 
@@ -166,11 +166,11 @@ class Timing:
 class Parameter:
     """A parameter of the model: SI value; `formula` if computed from other parameters.
 
-    `minimum` is the least value allowed; `exclusive_minimum` is whether the minimum itself is excluded.
-    `exact` is the rational that `value` is the nearest float to, as 5/3; None where `value` was given as a
-    float, in the shortest decimal that means it. Times that depend on a parameter are computed from `number`:
-    a tick decides by equality. `display_unit` is the unit of the topology's text and of outputs, as
-    Modelica's displayUnit; empty if it is `unit`.
+    `minimum` is the smallest valid value; `exclusive_minimum` is whether the minimum itself is excluded.
+    `exact` is the rational number whose nearest float is `value`, such as 5/3; None if `value` was given as a
+    float, which represents its shortest decimal. Times that depend on a parameter are computed from `number`,
+    since the equality of times determines the order of events. `display_unit` is the unit in the topology and
+    in outputs, as Modelica's displayUnit; empty if it is `unit`.
     """
 
     name: str
@@ -186,13 +186,13 @@ class Parameter:
 
     @property
     def number(self) -> Fraction:
-        """The value, exact."""
+        """The exact value."""
         return Fraction(repr(float(self.value))) if self.exact is None else self.exact
 
 
 @dataclass(frozen=True, slots=True)
 class State:
-    """A continuous state: name, SI unit, and the parameter that holds its start value."""
+    """A continuous state: name, SI unit, and the parameter for its start value."""
 
     name: str
     unit: str
@@ -201,9 +201,9 @@ class State:
 
 @dataclass(frozen=True, slots=True)
 class Hold:
-    """Row of u: output `output` of clock partition `clock`, acting from its tick + the timing `delay` on.
+    """A zero-order hold, a row of u: output `output` of clock partition `clock`.
 
-    Before the first computed value acts, the hold puts out zero.
+    A value acts from its tick + the timing `delay` on. Before the first value acts, the hold is zero.
     """
 
     name: str
@@ -214,16 +214,17 @@ class Hold:
 
 @dataclass(frozen=True, slots=True)
 class Receive:
-    """Row of r: the `operator` over the other peers received over a link, with the newest delivered values.
+    """A reduction over the newest packets of the other peers, a row of r: `operator` over the peers received
+    over a link.
 
     `age` is the use of the packet ages in seconds since sending: a "factor" of each value, the ages "alone",
-    or the last row of s of the "edge". With `before` it is the reduction of the previous tick; then there is
-    no edge.
+    or the last row of s of the "edge". With `before` the value is the reduction of the previous tick; then
+    there is no edge.
 
-    "mean" and "sum" are weighted by the link's graph. Without an `edge` they are of row `channel` of the
-    link's `SendPartition`, so that a complete graph of N peers costs N. With an `edge` the operator runs over
-    `edge(x, u, m, s, p, t)`, one evaluation per pair of peers: x, u, m, p, t are the receiving peer's, s
-    (n_c,) the sending peer's channels of the link. "max" and "min" ignore weights.
+    "mean" and "sum" are weighted by the link's graph. Without an `edge` the operands are row `channel` of the
+    link's `SendPartition`, so that the cost for a complete graph of N peers is proportional to N. With an
+    `edge` the operands are `edge(x, u, m, s, p, t)`, one evaluation per pair of peers: x, u, m, p, t are the
+    receiving peer's, s (n_c,) the sending peer's channels of the link. "max" and "min" ignore weights.
     """
 
     name: str
@@ -239,11 +240,11 @@ class Receive:
 class ClockPartition:
     """The tick function of a subsystem for one clock.
 
-    `tick(x, u, m, r, p, t) -> y (n_y,)`; `outputs` names the rows of y, `units` their SI units; `memories`
-    are the rows of y whose values at the previous tick make up m; `starts` are the parameters holding their
-    start values. Where `variants` are given, y is made of several such columns, one below the other, and tick
-    k computes the one numbered variants[k mod their number]: none in what was compiled (see
-    `frame.data_age`).
+    `tick(x, u, m, r, p, t) -> y (n_y,)`; `outputs` are the names of the rows of y, `units` their SI units;
+    `memories` are the rows of y whose values at the previous tick make up m; `starts` are the parameters for
+    their start values. With `variants`, y has several such columns, one below the other, and tick k computes
+    the column with the number variants[k mod len(variants)]; a compiled model has none (see
+    `lifting.data_age`).
     """
 
     clock: str
@@ -268,10 +269,10 @@ class SendPartition:
 
 @dataclass(frozen=True, slots=True)
 class ForcePorts:
-    """The port of held values at continuous states: `port(x, u, p, t) -> (potentials, then flows) (2 n,)`.
+    """The ports with held flows: `port(x, u, p, t) -> (potentials, then flows) (2 n,)`.
 
-    `parts` (n,) names the part of each; a flow counts into its part and follows from u and p alone. A part
-    does the work −flow · (change of the potential) while nothing switches.
+    `parts` (n,) are the names of the parts; a flow is positive into its part and depends only on u and p.
+    While no hold switches, the work done by a part is −flow · (change of the potential).
     """
 
     parts: tuple[str, ...]
@@ -280,9 +281,9 @@ class ForcePorts:
 
 @dataclass(frozen=True, slots=True)
 class Limit:
-    """The limit of a variable's magnitude: the parameter `limit`, possibly unused by functions.
+    """The limit of a variable's absolute value: the parameter `limit`, which functions may not depend on.
 
-    `value(x, u, p, t) -> the variable (1,)`; None for one that is a state.
+    `value(x, u, p, t) -> the variable (1,)`; None if the variable is a state.
     """
 
     name: str
@@ -293,7 +294,10 @@ class Limit:
 
 @dataclass(frozen=True, slots=True)
 class Replaced:
-    """The representation of a part in a linear analysis; `valid` describes the motions it applies to."""
+    """A part with other equations in a linear analysis.
+
+    `valid` describes the motions for which they are valid.
+    """
 
     part: str
     equations: tuple[str, ...]
@@ -302,16 +306,15 @@ class Replaced:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PeerType:
-    """All peers of one structure. `derivative(x, u, p, t) -> dx/dt (n_x,)`.
+    """All peers with the same structure. `derivative(x, u, p, t) -> dx/dt (n_x,)`.
 
-    A float among the values of a parameter is exact, but where `rounded` has it: by the parameter's place in
-    `parameters`, the rationals that floats round, each float at most one of them. `hands` are the parts that
-    the model calls hands, if they answer to how they are moved; `held` the parts that any hand is joined to,
-    or without hands those with a connector for hands.
-    `linear` is the peer type that represents it in a linear analysis, of the same states and parameters, None
-    where that is the peer type itself; `replaced` are the parts in which they differ.
-    `symbols` are those of published wall conditions with their parameters or numbers, empty unless every part
-    but hands has some.
+    A float value of a parameter is exact, except for parameters in `rounded`: (index in `parameters`, exact
+    rational values); different values have different floats. `hands` are the parts in the section `hands`
+    whose force depends on their motion; `held` are the parts that a hand is connected to, or without hands
+    the parts with a connector for hands. `linear` is the peer type in a linear analysis, with the same states
+    and parameters, None if it is the same; `replaced` are the parts with other equations there. `symbols` are
+    the symbols of published wall conditions with their parameters or numbers, empty unless every part except
+    hands has symbols.
     """
 
     name: str
@@ -333,7 +336,7 @@ class PeerType:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PeerColumn:
-    """A parameter that differs from peer to peer: `values` (count,) in SI."""
+    """A parameter with one value per peer: `values` (count,) in SI units."""
 
     name: str
     values: NDArray[np.float64]
@@ -341,10 +344,12 @@ class PeerColumn:
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """`count` peers of type `peer_type` (an index); `values` overrides parameters, by name, for this group.
+    """A group of `count` peers of the peer type with index `peer_type`.
 
-    An override is a `Parameter` of the same name, so that it can have a formula too; `columns` override
-    parameters peer by peer.
+    `values` override parameters for this group.
+
+    An override is a `Parameter` of the same name, so that it can have a formula; `columns` override
+    parameters for each peer.
     """
 
     name: str
@@ -356,7 +361,7 @@ class Group:
 
 @dataclass(frozen=True, slots=True)
 class Experiment:
-    """The duration of a simulation, in seconds (None if not given), and the seed of its random numbers."""
+    """The duration of a simulation in seconds (None if not given), and the seed of its random numbers."""
 
     duration: Fraction | None = None
     seed: int = 0
@@ -364,7 +369,10 @@ class Experiment:
 
 @dataclass(frozen=True, slots=True)
 class Axis:
-    """A range of a parameter, in SI; `line` and `column` are where the topology gives it, 0 if not known."""
+    """A range of a parameter in SI units.
+
+    `line` and `column` are its location in the topology, 0 if unknown.
+    """
 
     parameter: str
     low: Fraction
@@ -375,12 +383,12 @@ class Axis:
 
 @dataclass(frozen=True, slots=True)
 class Model:
-    """A compiled model. `dropped` lists the unused items of the topology, with the reason.
+    """A compiled model. `dropped` are the unused items of the topology, with the reason.
 
     `followers` are the names of all parameters and timings with a formula, of any group, in order of
-    dependence. `warnings` are unusual parts of the topology, with their locations. `region` are the axes x
-    and y of the study of that name, with none or one if unspecified. `within` are the delays given as a
-    range; their value is its middle. `tune` are the entries of the study of that name, as option texts.
+    dependence. `warnings` are texts on unusual parts of the topology, with locations. `region` are the axes x
+    and y of the study `region`, with none or one if unspecified. `within` are the delays given as a range,
+    whose value is the middle of the range. `tune` are the entries of the study `tune`, as option texts.
     """
 
     name: str

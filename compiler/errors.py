@@ -2,7 +2,7 @@
 
 Takes: nothing.
 Gives: `SourceLocation` and `location_in`, `Diagnostic`, `ApcError` and the collector `Mistakes`; `visible`,
-`nearest`.
+`nearest`, `equally_near`.
 Guarantees: the errors of one file are reported together, in file order, each once. Control characters are
 escaped.
 Does not: print, or decide exit codes.
@@ -17,8 +17,8 @@ from dataclasses import dataclass, field, replace
 
 SHOWN = 75  # characters of a source line, so that it fits a terminal of 80 with its indent
 
-# A line to write that is longer than this is not read to its end: what is wrong is said alone.
-LONGEST_HINT = 400
+# A fix longer than this number of characters is not read to its end: the error is printed alone.
+LONGEST_FIX = 400
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -67,11 +67,11 @@ def location_in(location: SourceLocation, text: str, offset: int) -> SourceLocat
 
 @dataclass(frozen=True, slots=True)
 class Diagnostic:
-    """One error in the input: its subject, the actual and the expected value, the suggested line.
+    """One error in the input: its subject, the expected and the actual value, a fix or advice.
 
-    It reads `LOCATION: CODE WHAT wants EXPECTED, got GOT. Write: HINT`; `expected`, `got` and `hint`
-    may be empty, and then their part of the sentence is left out. `subject` is the name of the unit, part or
-    number at fault, for decisions: no text has it.
+    It reads `LOCATION: CODE MESSAGE: expected EXPECTED, got GOT. ADVICE. Try: FIX`; empty parts are left out.
+    `fix` is text that can be pasted at the location (alternatives separated by `, or `), `advice` a sentence.
+    `subject` is the name of the unit, part or number at fault; it is for decisions and is not printed.
     """
 
     code: str
@@ -79,7 +79,8 @@ class Diagnostic:
     message: str
     expected: str = ""
     got: str = ""
-    hint: str = ""
+    fix: str = ""
+    advice: str = ""
     subject: str = field(default="", compare=False, repr=False)
 
     def __str__(self) -> str:
@@ -95,22 +96,28 @@ class Diagnostic:
 
     @property
     def sentence(self) -> str:
-        """The message without place, code and source line."""
+        """The message without location, code and source line."""
         text = self.message
         if self.expected:
-            text += f" wants {self.expected}"
+            text += f": expected {self.expected}"
         if self.got:
-            text += f", got {self.got}" if self.expected else f" {self.got}"
-        if not text.endswith((".", "?", "!")):
-            text += "."
-        if 0 < len(self.hint) <= LONGEST_HINT:
-            text += f" Write: {self.hint}"
+            text += f", got {self.got}"
+        text = _ended(text)
+        if self.advice:
+            text += f" {_ended(self.advice[0].upper() + self.advice[1:])}"
+        if 0 < len(self.fix) <= LONGEST_FIX:
+            text += f" Try: {self.fix}"
         return _in_single_line(text)
 
     @property
     def reason(self) -> str:
-        """The description of the error, without the suggestion."""
-        return replace(self, hint="").sentence
+        """The description of the error, without fix and advice."""
+        return replace(self, fix="", advice="").sentence
+
+
+def _ended(text: str) -> str:
+    """Return a sentence with a full stop unless it has a final mark."""
+    return text if text.endswith((".", "?", "!")) else f"{text}."
 
 
 def _in_single_line(text: str) -> str:
@@ -147,17 +154,18 @@ class Mistakes:
         *,
         expected: str = "",
         got: str = "",
-        hint: str = "",
+        fix: str = "",
+        advice: str = "",
         subject: str = "",
     ) -> None:
         """Record one mistake; the same mistake twice counts once.
 
         Parameters
         ----------
-        code, location, message, expected, got, hint, subject
-            As `Diagnostic` has them.
+        code, location, message, expected, got, fix, advice, subject
+            The fields of `Diagnostic`.
         """
-        self._result[Diagnostic(code, location, message, expected, got, hint, subject)] = None
+        self._result[Diagnostic(code, location, message, expected, got, fix, advice, subject)] = None
 
     def take(self, error: ApcError) -> None:
         """Record every mistake of an error raised further down."""
@@ -216,6 +224,23 @@ def nearest(name: str, texts: Iterable[str], *, similarity: float = 0.6) -> str:
         known.sort(key=lambda text: -_at_location(name, text))
     close = difflib.get_close_matches(name, known[:FEW_NAMES], n=1, cutoff=similarity)
     return close[0] if close else ""
+
+
+def equally_near(name: str, close: str, texts: Iterable[str]) -> list[str]:
+    """Return the names of the length of `close`, the nearest to a misspelt one, that are as near as it is:
+    at most three.
+    """
+    import difflib  # for a mistake only
+
+    def likeness(text: str) -> float:
+        """Return the similarity of a known name and the misspelt one, from 0 to 1."""
+        return difflib.SequenceMatcher(None, text, name[:200]).ratio()
+
+    if not close:
+        return []
+    others = [*dict.fromkeys(text for text in texts if len(text) == len(close))][:FEW_NAMES]
+    equal = [text for text in others if likeness(text) == likeness(close)][:3]
+    return equal if close in equal else [close]
 
 
 def _at_location(name: str, text: str) -> int:

@@ -1,6 +1,6 @@
-"""CasADi functions as plain data, and back: CasADi's own reader is never applied to file contents.
+"""CasADi functions as plain data and the reverse, without CasADi's deserialization of file contents.
 
-Takes: the functions of a peer type, or the JSON of one. Gives: `PlainFunction`, `straight`; `walk`, `RULES`,
+Takes: the functions of a peer type. Gives: `PlainFunction`, `straight`; `walk`, `RULES`,
 `ROUNDED`, `symbolic`: its operations over any number type; `AlgebraicLoop`, `composed`.
 Guarantees: a function is arithmetic from a short list of operations on its inputs and constants, and for each
 nonlinear loop Newton's iteration with fixed options. Data are checked completely before a function is built,
@@ -8,7 +8,7 @@ so that an untrusted text can build no other function, and none larger than the 
 same data.
 Does not: interpret functions.
 
-CasADi's serialization can hold compilers to call and libraries to load, with options, and CasADi trusts it.
+CasADi's serialization can contain calls of compilers and libraries, which CasADi executes without checks.
 
 Values are numbered: first the entries of the inputs in order, then the constants, the tables, and then the
 operations, each with the numbers of its operands; "interpolate" and "slope" take a table and an abscissa.
@@ -31,16 +31,20 @@ import casadi
 
 from apc.compiler.interpolation import TABLE, Interpolation, function_of, table_of
 
-READ, SLOPE = "interpolate", "slope"  # of a table, whose number comes first, and of its lines
+READ, SLOPE = "interpolate", "slope"  # value and slope of a table, which is the first operand
 
 
-def _quotient(above: Any, below: Any) -> Any:
-    """Return a quotient; that of two conditions, which are whole numbers, is a rational too."""
-    return Fraction(above, below) if isinstance(above, int) and isinstance(below, int) else above / below
+def _quotient(numerator: Any, denominator: Any) -> Any:
+    """Return a quotient; the quotient of two integers (conditions) is a rational number."""
+    return (
+        Fraction(numerator, denominator)
+        if isinstance(numerator, int) and isinstance(denominator, int)
+        else numerator / denominator
+    )
 
 
-# What the operations are of Python's numbers, and of all that compute as they do; a power means something
-# else in every kind of number. A condition is 0 or 1.
+# The operations on Python's numbers and number types with the same operators, without the power, which every
+# number type defines differently. A condition is 0 or 1.
 RULES: dict[str, Callable[..., Any]] = {
     "neg": operator.neg,
     "sq": lambda a: a * a,
@@ -63,13 +67,13 @@ RULES: dict[str, Callable[..., Any]] = {
     "ne": lambda a, b: int(a != b),
     "and": lambda a, b: int(a != 0 and b != 0),
     "or": lambda a, b: int(a != 0 or b != 0),
-    # The product with a condition: zero whatever b is, when the condition is false.
+    # The product with a condition: zero for every b if the condition is false.
     "if_else_zero": lambda a, b: b if a != 0 else 0 * b,
     READ: Interpolation.value,
     SLOPE: Interpolation.slope,
 }
 
-# Those that have no rational value of a rational number.
+# Operations whose value for a rational number is not rational.
 ROUNDED: dict[str, Callable[..., float]] = {
     name: getattr(math, name)
     for name in (
@@ -83,9 +87,10 @@ _CODES = {
     if word not in (READ, SLOPE)
 }
 _NAMES = {code: word for word, code in _CODES.items()}
-# CasADi's Newton iteration ends before it takes a step smaller than this, in SI. That step is taken
-# afterwards and squares the error: the rest is rounding. A bound on the residual would depend on its scale.
-POLISH = "polish"  # the name of that step
+# CasADi's Newton iteration ends before a step smaller than `abstolStep`, in SI units. A last step is added,
+# which squares the error, so that only rounding errors remain. A bound on the residual would depend on its
+# scale.
+POLISH = "polish"  # the name of the last step
 NEWTON = {"abstol": 0.0, "abstolStep": 1e-11, "max_iter": 100, "show_eval_warnings": False}
 
 
@@ -94,7 +99,7 @@ class PlainFunction:
     """A function of columns to columns.
 
     `inputs` are (name, number of entries); `operations` are (word, value) or (word, value, value); `results`
-    the values that make up each output; `tables` the tables that some of them look up.
+    are the indices of the values in each output; `tables` the tables used by operations.
     """
 
     inputs: tuple[tuple[str, int], ...]
@@ -107,14 +112,15 @@ class PlainFunction:
 def walk(
     function: PlainFunction, values: Iterable[Any], rule: Callable[[str], Callable[..., Any]]
 ) -> list[Any]:
-    """Return a function's values in any kind of number: those of its inputs and constants, then all others.
+    """Return all values of a function in some number type: inputs, constants, tables and operations,
+    in order.
 
     Parameters
     ----------
     function
         The function.
     values
-        The entries of its inputs, then its constants; its tables follow as they are.
+        The entries of the inputs, then the constants.
     rule
         The operations for this number type.
     """
@@ -126,9 +132,9 @@ def walk(
 
 @functools.cache
 def symbolic(word: str) -> Callable[..., Any]:
-    """Return the CasADi expression of an operation."""
+    """Return the CasADi expression of an operation, as a function of its operands."""
     if word == READ:
-        return lambda table, at: function_of(table)(at)
+        return lambda table, time: function_of(table)(time)
     return lambda *operands: (casadi.SX.unary if len(operands) == 1 else casadi.SX.binary)(
         _CODES[word], *operands
     )
@@ -136,48 +142,51 @@ def symbolic(word: str) -> Callable[..., Any]:
 
 @dataclass(frozen=True, slots=True)
 class AlgebraicLoop:
-    """A nonlinear loop: `given(…) -> (begin (n,), q (m,))`, `residual(z (n,), q (m,)) -> (n,)`, zero at z."""
+    """A nonlinear loop: find z with `residual(z (n,), q (m,)) -> (n,)` equal to zero.
+
+    `given(…) -> (begin (n,), q (m,))` computes the start value and the parameters.
+    """
 
     given: Any  # casadi.Function
     residual: Any  # casadi.Function
 
 
 def composed(name: str, loops: Sequence[AlgebraicLoop], result: Any, words: Sequence[str]) -> Any:
-    """Return the function that solves loops one after another and then gives a result.
+    """Return the function that solves loops in sequence by Newton's iteration, then computes a result.
 
     Parameters
     ----------
     name
-        The function's name.
+        The name of the function.
     loops, result
-        SX functions of the inputs and of the solutions of the loops before.
+        SX functions of the inputs and of the solutions of the previous loops.
     words
         The names of the inputs.
     """
     inputs = [casadi.MX.sym(word, result.numel_in(index)) for index, word in enumerate(words)]
-    outcome: list[Any] = []
+    solutions: list[Any] = []
     for index, loop in enumerate(loops):
-        begin, q = loop.given.call([*inputs, *outcome])
+        begin, q = loop.given.call([*inputs, *solutions])
         z, given = (casadi.SX.sym(word, loop.residual.numel_in(i)) for i, word in enumerate("zq"))
         residual = loop.residual(z, given)
         solver = casadi.rootfinder(f"loop{index}", "newton", {"x": z, "p": given, "g": residual}, NEWTON)
         last_step = casadi.solve(casadi.jacobian(residual, z), residual)
         polish = casadi.Function(POLISH, [z, given], [z - last_step])
-        outcome.append(polish(solver(x0=begin, p=q)["x"], q))
-    outputs = result.call([*inputs, *outcome])
+        solutions.append(polish(solver(x0=begin, p=q)["x"], q))
+    outputs = result.call([*inputs, *solutions])
     return casadi.Function(name, inputs, outputs, list(words), result.name_out())
 
 
 def straight(function: Any) -> PlainFunction:
-    """Return an SX function's data, with the nonzeros of sparse values."""
+    """Return the data of an SX function; sparse values are represented by their nonzeros."""
     inputs = tuple((word, int(function.nnz_in(i))) for i, word in enumerate(function.name_in()))
     starts = [0, *itertools.accumulate(size for _, size in inputs)]
     codes = [function.instruction_id(k) for k in range(function.n_instructions())]
-    # By their text zeros of both signs are two constants, and NaN is one.
+    # Constants are distinguished by their text: zeros of both signs differ, all NaNs are equal.
     texts = {
         k: repr(function.instruction_constant(k)) for k, code in enumerate(codes) if code == casadi.OP_CONST
     }
-    called = _called(function, [k for k, code in enumerate(codes) if code == casadi.OP_CALL])
+    called = _called_tables(function, [k for k, code in enumerate(codes) if code == casadi.OP_CALL])
     constants, tables = dict.fromkeys(texts.values()), dict.fromkeys(table for _, table in called.values())
     number = {item: starts[-1] + index for index, item in enumerate((*constants, *tables))}
     work = [0] * function.sz_w()
@@ -185,36 +194,37 @@ def straight(function: Any) -> PlainFunction:
     results = [[0] * function.nnz_out(i) for i in range(function.n_out())]
 
     def add(*operation: Any) -> int:
+        """Add an operation, and return the index of its value."""
         operations.append(operation)
         return starts[-1] + len(number) + len(operations) - 1
 
     for k, code in enumerate(codes):
-        used, given = function.instruction_input(k), function.instruction_output(k)
+        operands, targets = function.instruction_input(k), function.instruction_output(k)
         if code == casadi.OP_OUTPUT:
-            results[given[0]][given[1]] = work[used[0]]
+            results[targets[0]][targets[1]] = work[operands[0]]
             continue
         if code == casadi.OP_INPUT:
-            value = starts[used[0]] + used[1]
+            value = starts[operands[0]] + operands[1]
         elif code == casadi.OP_CONST:
             value = number[texts[k]]
         elif code == casadi.OP_CALL:
             name, table = called[k]
-            value = add(READ if name == TABLE else SLOPE, number[table], work[used[0]])
-            if name != TABLE:  # a derivative, of any order, is the slope times what it is taken by
-                value = add("mul", value, work[used[-1]])
+            value = add(READ if name == TABLE else SLOPE, number[table], work[operands[0]])
+            if name != TABLE:  # a derivative of any order is the slope times the derivative of the time
+                value = add("mul", value, work[operands[-1]])
         elif code in _NAMES:
-            value = add(_NAMES[code], *(work[index] for index in used))
+            value = add(_NAMES[code], *(work[index] for index in operands))
         else:
             raise ValueError(f"CasADi's operation {code} of {function.name()} is none of ours")
-        work[given[0]] = value
+        work[targets[0]] = value
     outputs = tuple(map(tuple, results))
     return PlainFunction(inputs, tuple(map(float, constants)), tuple(operations), outputs, tuple(tables))
 
 
-def _called(function: Any, calls: Sequence[int]) -> dict[int, tuple[str, Interpolation]]:
-    """Return the functions called by an SX function's call instructions, and the interpolated table."""
+def _called_tables(function: Any, calls: Sequence[int]) -> dict[int, tuple[str, Interpolation]]:
+    """Return the name and the table of the functions called by an SX function, by instruction index."""
     expressions: Any = function.instructions_sx() if calls else None
-    known: dict[bytes, Interpolation] = {}  # of equal rows, which are one table
+    known: dict[bytes, Interpolation] = {}  # tables with equal rows are the same table
     result = {}
     for k in calls:
         item = expressions[k].which_function()

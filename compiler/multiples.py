@@ -1,8 +1,8 @@
-"""Whole multiples of exact times: the least common one, and the largest common divisor.
+"""Least common multiple and greatest common divisor of exact times.
 
-Takes: rationals, of seconds mostly. Gives: `common_multiple`, `common_divisor`.
+Takes: rational numbers, usually times in seconds. Gives: `common_multiple`, `common_divisor`.
 Guarantees: exact.
-Does not: know a clock.
+Does not: handle clocks.
 """
 
 from __future__ import annotations
@@ -13,16 +13,18 @@ from fractions import Fraction
 
 
 def common_multiple(times: Iterable[Fraction]) -> Fraction:
-    """Return the least time that is a whole multiple of every one of them, one or more, all above 0."""
-    listed = list(times)
+    """Return the least common multiple of one or more positive times."""
+    values = list(times)
     return Fraction(
-        math.lcm(*(time.numerator for time in listed)), math.gcd(*(time.denominator for time in listed))
+        math.lcm(*(time.numerator for time in values)), math.gcd(*(time.denominator for time in values))
     )
 
 
 def common_divisor(times: Iterable[Fraction]) -> Fraction:
-    """Return the largest rational of which every time is a whole multiple."""
-    listed = list(times)
+    """Return the greatest common divisor of times: the largest rational with all times as integer
+    multiples.
+    """
+    values = list(times)
     return Fraction(
-        math.gcd(*(time.numerator for time in listed)), math.lcm(*(time.denominator for time in listed))
+        math.gcd(*(time.numerator for time in values)), math.lcm(*(time.denominator for time in values))
     )

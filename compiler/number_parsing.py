@@ -1,7 +1,7 @@
-"""Parsing of plain numbers: ASCII digits, a sign, a point, an exponent, and nothing else.
+"""Parsing of plain numbers: only ASCII digits, a sign, a point and an exponent.
 
 Takes: texts. Gives: `plain_float`, `plain_int`.
-Guarantees: other forms accepted by Python are refused: `1_0`, digits of other scripts, `nan`.
+Guarantees: other number formats of Python raise ValueError: `1_0`, digits of other scripts, `nan`.
 Does not: handle units (see `language.units`), or locations.
 """
 
@@ -11,7 +11,10 @@ import math
 
 
 def plain_float(text: str) -> float:
-    """Return the number in a text, with or without surrounding spaces. Raises ValueError otherwise."""
+    """Return the finite number in a text, with or without surrounding spaces.
+
+    Raises ValueError for other texts.
+    """
     if not text.isascii() or "_" in text:
         raise ValueError("not a plain number")
     number = float(text)
@@ -21,7 +24,7 @@ def plain_float(text: str) -> float:
 
 
 def plain_int(text: str) -> int:
-    """Return the integer in a text, with or without surrounding spaces. Raises ValueError otherwise."""
+    """Return the integer in a text, with or without surrounding spaces. Raises ValueError for other texts."""
     if not text.isascii() or "_" in text:
         raise ValueError("not a plain number")
     return int(text)

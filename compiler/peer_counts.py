@@ -3,7 +3,7 @@
 Takes: groups, peer types and links of a compiled model.
 Gives: `with_received`, `received_sums`; `recounted`, `least_peers`, `peers_of`.
 Guarantees: a model with changed counts equals the compiled topology with these counts.
-Does not: change the members of a heterogeneous group, or a graph with named peers: that is refused.
+Does not: change the count of a group with different peers, or of peers named by a graph: E626.
 """
 
 from __future__ import annotations
@@ -34,46 +34,52 @@ from apc.compiler.errors import Mistakes, SourceLocation
 from apc.compiler.source.reading import fault
 from apc.compiler.weights import sum_weights
 
-COUNT_ABOUT = "peers heard over the link, counted with their weights"
+COUNT_ABOUT = "peers received over the link, counted with their weights"
 
 
 def with_received(
     groups: Sequence[Group], peer_types: Sequence[PeerType], links: Sequence[Link]
 ) -> tuple[Group, ...]:
-    """Return the groups with the number of senders to each of their peers over a link, `count(LINK)`.
+    """Return the groups with `count(LINK)`, the sum of the weights of each peer's senders over a link.
 
-    It is a parameter of the group, or a column if peers differ.
+    Without weights it is the number of senders. It is a parameter of the group, or a column if it differs
+    between the peers of the group; peer types that do not use it have none.
 
     Parameters
     ----------
     groups, peer_types, links
-        Those of the model; on a graph that isn't complete, every peer sends.
+        The groups, peer types and links of the model; on a graph that isn't complete, every peer sends.
     """
-    received = {count_of(link.name): _received(link, groups, peer_types) for link in links}
-    result = []
+    sums_by_link = {count_of(link.name): _received(link, groups, peer_types) for link in links}
+    new_groups = []
     for index, group in enumerate(groups):
-        values = [value for value in group.values if value.name not in received]
-        columns = [column for column in group.columns if column.name not in received]
-        for name, by_group in received.items():
+        values = [value for value in group.values if value.name not in sums_by_link]
+        columns = [column for column in group.columns if column.name not in sums_by_link]
+        for name, sums in sums_by_link.items():
             if name in peer_types[group.peer_type].parameters:
-                number = by_group[index]
-                if isinstance(number, Fraction):
-                    values.append(Parameter(name, "1", float(number), description=COUNT_ABOUT, exact=number))
+                weight_sum = sums[index]
+                if isinstance(weight_sum, Fraction):
+                    values.append(
+                        Parameter(name, "1", float(weight_sum), description=COUNT_ABOUT, exact=weight_sum)
+                    )
                 else:
-                    columns.append(PeerColumn(name, number))
-        result.append(replace(group, values=tuple(values), columns=tuple(columns)))
-    return tuple(result)
+                    columns.append(PeerColumn(name, weight_sum))
+        new_groups.append(replace(group, values=tuple(values), columns=tuple(columns)))
+    return tuple(new_groups)
 
 
 def received_sums(link: Link, peers: int) -> NDArray[Any]:
-    """Return each peer's sum of weights over a link of arcs, as `sum_weights` does."""
+    """Return the exact sum of the weights of each peer's incoming arcs over a link with arcs (N,)."""
     return sum_weights(link.graph.arcs[:, 1], link.graph.weights, peers)
 
 
 def _received(
     link: Link, groups: Sequence[Group], peer_types: Sequence[PeerType]
 ) -> list[Fraction | NDArray[np.float64]]:
-    """Return, by group, the sum of weights received by its peers over a link: one number if equal."""
+    """Return the sums of weights received by the peers of each group over a link.
+
+    A sum is one number if it is the same for all peers of a group, else an array (count,).
+    """
     counts = [group.count for group in groups]
     peers, shape = sum(counts), link.graph.shape
     if shape == "complete":
@@ -81,7 +87,7 @@ def _received(
             any(send.link == link.name for send in peer_types[group.peer_type].sends) for group in groups
         ]
         total = sum(itertools.compress(counts, sends))
-        return [Fraction(total - does) for does in sends]
+        return [Fraction(total - is_sender) for is_sender in sends]
     received = np.full(peers, min(2, peers - 1) if shape == "ring" else 1, dtype=object)
     if shape == "star":
         received[0] = peers - 1
@@ -106,7 +112,7 @@ def recounted(system: Model, counts: Mapping[str, Fraction], location: SourceLoc
     Raises
     ------
     ApcError
-        E626 a count that can't be: no whole number, or of peers that differ or are named by a graph.
+        E626 an invalid count: not a whole number, or of peers that differ or are named by a graph.
     """
     mistakes = Mistakes()
     total = sum(counts.values())
@@ -125,15 +131,15 @@ def recounted(system: Model, counts: Mapping[str, Fraction], location: SourceLoc
                 raise fault("E626", location, name, expected, f"{float(count):.12g}")
             if local:
                 message = f"{local[0]} has one value for each of the {group.count} peers of {group.name}"
-                raise fault("E626", location, f"{message}: their count follows from them")
+                raise fault("E626", location, f"{message}; the count can't be changed")
             if arcs:
-                message = f"the graph of {arcs[0]} names its peers: {name} is what it is in the topology"
+                message = f"the graph of {arcs[0]} lists peers by number; {name} can't be changed"
                 raise fault("E626", location, message)
             if shaped and total > MOST_PLACED:
                 expected = f"at most {MOST_PLACED:,} peers where {shaped[0]} isn't complete"
                 raise fault("E626", location, name, expected, f"{int(total):,}")
     if not mistakes and total < least_peers(system.peer_types):
-        message, expected = "the number of all peers", "at least 2: parts follow the others"
+        message, expected = "total number of peers", "at least 2, as a part receives from the other peers"
         raise fault("E626", location, message, expected, f"{int(total)}")
     mistakes.raise_if_any()
     return replace(
@@ -147,11 +153,11 @@ def recounted(system: Model, counts: Mapping[str, Fraction], location: SourceLoc
 
 
 def least_peers(peer_types: Sequence[PeerType]) -> int:
-    """Return the smallest number of peers of a model: two if a part depends on the others."""
+    """Return the smallest number of peers of a model: two if a part receives from other peers, else one."""
     receives = any(partition.receives for peer_type in peer_types for partition in peer_type.clocks)
     return 2 if receives else 1
 
 
 def peers_of(counts: Mapping[str, Fraction]) -> dict[str, Fraction]:
-    """Return the value of the name `peers` for these counts of groups."""
+    """Return the value of the name `peers` for counts of groups."""
     return {PEERS: sum(counts.values(), Fraction(0))}

@@ -1,8 +1,8 @@
 """The compiler stages in sequence: a topology file to a compiled model, or to any earlier stage.
 
 Takes: a path. Gives: `compile_topology`, the model; `compile_again`, from stored texts; `run_stages`,
-`each_stage`, `stages_of`, the values of single stages; `check_definition`.
-Guarantees: each stage uses only the value of the previous one.
+`each_stage`, `stages_of`, the results of single stages; `check_definition`.
+Guarantees: each stage uses only the result of the previous stage.
 Does not: save files.
 """
 
@@ -30,57 +30,57 @@ StageValue = Source | Topology | FlatSystem | ClockedSystem | SortedSystem | Mod
 
 
 def compile_topology(path: Path) -> Model:
-    """Compile a topology file. Raises ApcError with its mistakes."""
+    """Return the compiled model of a topology file. Raises ApcError with all mistakes of the topology."""
     value = run_stages(path, until="compiled")
     assert isinstance(value, Model)
     return value
 
 
 def compile_again(origin: Origin, folder: Path) -> Model:
-    """Compile the texts of a model's origin; no file is read.
+    """Return the model compiled from the texts of a model's origin; no file is read.
 
     Parameters
     ----------
     origin
         The texts.
     folder
-        Their location in messages.
+        The folder of the texts in messages.
 
     Raises
     ------
     ApcError
-        Their errors.
+        The texts have errors.
     """
     with replayed(replayable(origin, folder)):
         return compile_topology(folder / origin.topology)
 
 
 def check_definition(path: Path) -> str:
-    """Read a file with a component or connector, and its folder; return its name and kind.
+    """Check the definition of a component or connector in a file, and return its name and kind.
 
     Returns
     -------
-    Its name and kind; an empty text of a topology.
+    The name and the kind; an empty text for a topology.
 
     Raises
     ------
     ApcError
-        The errors of the definition.
+        The definition, or another file in its folder, has errors.
     """
     source = read_source(path)
     peer_type, name = definition_of(source)
     if not peer_type:
         return ""
-    alongside: list[ApcError] = []
-    library = Library((path.parent,), alongside)
+    other_errors: list[ApcError] = []
+    library = Library((path.parent,), other_errors)
     mistakes = Mistakes()
     with mistakes:
         if peer_type == "connector":
             library.connector(name)
         elif component := library.component(name):
             check_single(component, SourceLocation(str(path)), mistakes)
-    # Its own mistakes first.
-    result = [*mistakes.result, *(mistake for error in alongside for mistake in error.mistakes)]
+    # The mistakes of the definition come before those of the other files.
+    result = [*mistakes.result, *(mistake for error in other_errors for mistake in error.mistakes)]
     if result:
         raise ApcError(result)
     return f"{name}, a {peer_type}"
@@ -94,12 +94,12 @@ def linear_system(topology: Topology) -> SortedSystem | None:
 
 
 def run_stages(path: Path, *, until: Stage) -> StageValue:
-    """Run the stages up to and including `until`. Raises ApcError with the mistakes of one that fails."""
+    """Return the result of the stage `until`. Raises ApcError with the mistakes of the stage that fails."""
     return next(value for stage, value in each_stage(path) if stage == until)
 
 
 def each_stage(path: Path) -> Iterator[tuple[Stage, StageValue]]:
-    """Run the stages in sequence, yielding each one's name and value when done."""
+    """Run the stages in sequence; yield the name and the result of each stage."""
     texts: dict[str, bytes] = {}
     with part("source"), recorded(texts):
         source = read_source(path)
@@ -107,14 +107,14 @@ def each_stage(path: Path) -> Iterator[tuple[Stage, StageValue]]:
 
 
 def stages_of(source: Source, texts: dict[str, bytes] | None = None) -> Iterator[tuple[Stage, StageValue]]:
-    """Run the stages in sequence on a source with a path.
+    """Run the stages in sequence on a source with a path; yield the name and the result of each stage.
 
     Parameters
     ----------
     source
         The topology.
     texts
-        The files read for it, by path; further files read are added.
+        The contents of the files read so far, by path; the files read by the stages are added.
     """
     assert source.path is not None
     path, texts = source.path, {} if texts is None else texts

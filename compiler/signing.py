@@ -16,7 +16,7 @@ from pathlib import Path
 
 import platformdirs
 
-SECRET = "secret"  # its file in the folder
+SECRET = "secret"  # the file of the secret in the folder
 LENGTH = 32  # bytes of the secret
 
 
@@ -29,13 +29,9 @@ def cache_folder() -> Path | None:
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         if os.name == "posix":
-            everyone = (path.stat() for path in (folder, *folder.resolve().parents))
-            if (
-                folder.is_symlink()
-                or folder.stat().st_uid != os.geteuid()
-                or not all(map(_is_safe, everyone))
-            ):
-                return None  # contents by others are indistinguishable from the user's
+            folders = (path.stat() for path in (folder, *folder.resolve().parents))
+            if folder.is_symlink() or folder.stat().st_uid != os.geteuid() or not all(map(_is_safe, folders)):
+                return None  # files of other users are not distinguishable from the user's own
             folder.chmod(0o700)
     except OSError:
         return None
@@ -43,18 +39,19 @@ def cache_folder() -> Path | None:
 
 
 def seal(content: bytes) -> str:
-    """Return the seal of some bytes; empty if there is no secret to make it with."""
+    """Return the seal of bytes, a keyed hash in hexadecimal; empty if there is no secret."""
     secret = _secret(_folder())
     return hmac.digest(secret, content, "sha256").hex() if secret else ""
 
 
 def is_sealed(content: bytes, text: str) -> bool:
-    """Return whether a seal is the one this user's apc made of some bytes."""
+    """Return whether a text is the seal of bytes by this user's secret."""
     expected = seal(content)
     return bool(expected) and hmac.compare_digest(expected.encode(), text.encode())
 
 
 def _folder() -> Path:
+    """Return the path of the user's cache folder."""
     return Path(platformdirs.user_cache_dir("apc", appauthor=False))
 
 
@@ -66,17 +63,18 @@ def _is_safe(folder: os.stat_result) -> bool:
 
 @functools.lru_cache(maxsize=1)
 def _secret(folder: Path) -> bytes:
-    """Return the user's secret, made if there is none; empty if none can be kept."""
+    """Return the user's secret, created if necessary; empty if it cannot be stored privately."""
     if cache_folder() is None:
         return b""
     path = folder / SECRET
     try:
         if not (secret := _read(path)):
-            made = folder / f".{SECRET}{os.getpid()}"
-            made.unlink(missing_ok=True)
-            made.touch(0o600, exist_ok=False)
-            made.write_bytes(os.urandom(LENGTH))
-            made.replace(path)  # of two at once the second stays: what the first has sealed is compiled again
+            new_file = folder / f".{SECRET}{os.getpid()}"
+            new_file.unlink(missing_ok=True)
+            new_file.touch(0o600, exist_ok=False)
+            new_file.write_bytes(os.urandom(LENGTH))
+            # Of two simultaneous secrets the second remains: files sealed with the first are compiled again.
+            new_file.replace(path)
             secret = _read(path)
     except OSError:
         return b""
@@ -84,7 +82,7 @@ def _secret(folder: Path) -> bytes:
 
 
 def _read(path: Path) -> bytes:
-    """Return the secret in a file; empty if there is none, or others may have seen it."""
+    """Return the secret in a file; empty if there is none, or if other users can read the file."""
     if path.is_symlink() or not path.is_file():
         return b""
     result = path.stat()

@@ -3,9 +3,10 @@
 Takes: `Model`.
 Gives: `save`, `opened`: to and from a file; `encoded`, `decoded`: to and from bytes; `model_of`, the bytes of
 a model alone.
-Guarantees: written whole or not at all; equal models give equal bytes. Functions are in CasADi's own
-serialization, which can hold commands to call: only what this user's apc wrote may be read here.
-Does not: ask who wrote a file, or whether the topology has changed since (see `cache`).
+Guarantees: a file is written completely or not at all; equal models give equal bytes. Functions are in
+CasADi's serialization, which can contain calls of commands: only files written by this user's apc may be
+read.
+Does not: check the author of a file, or changes of the topology (see `cache`).
 """
 
 from __future__ import annotations
@@ -27,17 +28,20 @@ from apc.compiler.timings import part
 
 @part("save")
 def save(system: Model, path: Path, *, compiled: bool = False) -> None:
-    """Write a model; `compiled` if it is as its texts compile now. Raises ApcError if it can't be written."""
+    """Write a model to a file. Raises ApcError if the file can't be written.
+
+    `compiled` is whether the model is the unchanged result of compiling its texts.
+    """
     write_bytes(path, packed(system.origin, model_of(system), compiled=compiled))
 
 
 def model_of(system: Model) -> bytes:
-    """Return a model without the texts that it was made from."""
+    """Return the bytes of a model without its source texts."""
     return encoded(replace(system, origin=Origin(system.origin.topology)))
 
 
 def opened(archive: Archive) -> Model:
-    """Return the model of a file that this user's apc has sealed."""
+    """Return the model in a file that has a valid seal of this user."""
     assert archive.sealed
     return replace(decoded(archive.model), origin=archive.origin)
 
@@ -48,11 +52,12 @@ def encoded(system: Model) -> bytes:
 
 
 def decoded(model: bytes) -> Model:
-    """Return the model of bytes that `encoded` gave."""
+    """Return the model from bytes written by `encoded`."""
     return msgspec.msgpack.decode(model, type=Model, dec_hook=_decode)
 
 
 def _plain(value: Any) -> Any:
+    """Return a value of a model as plain data for msgpack."""
     match value:
         case Fraction():
             return str(value)
@@ -63,10 +68,11 @@ def _plain(value: Any) -> Any:
     raise NotImplementedError(type(value))
 
 
-def _decode(requested: Any, value: Any) -> Any:
-    if requested is Fraction:
+def _decode(type_: Any, value: Any) -> Any:
+    """Return a value of a model from plain data."""
+    if type_ is Fraction:
         return Fraction(value)
-    if requested is casadi.Function:
+    if type_ is casadi.Function:
         return casadi.Function.deserialize(value)
-    peer_type, shape, numbers = value
-    return np.frombuffer(numbers, peer_type).reshape(shape)
+    dtype, shape, numbers = value
+    return np.frombuffer(numbers, dtype).reshape(shape)

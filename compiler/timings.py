@@ -2,8 +2,8 @@
 
 Takes: the name of a part, around its code.
 Gives: `part`, `record`, `recording`.
-Guarantees: a part inside another counts for itself alone; where nobody records, nothing is measured.
-Does not: print, or look into other processes.
+Guarantees: the time of a part does not include the parts inside it; without a recording nothing is measured.
+Does not: print, or measure other processes.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-# What is in no part: modules are imported where they are first needed, between the parts.
+# Time outside of all parts: modules are imported on first use, between the parts.
 REST = "imports, rest"
 
-_used: dict[str, float] | None = None  # seconds by part, in the order they were first entered
-_within: list[float] = []  # of each part that is open, the seconds of the parts inside it
+_used: dict[str, float] | None = None  # seconds by part, in the order of first use
+_within: list[float] = []  # for each open part, the seconds of the parts inside it
 
 
 def recording() -> bool:
@@ -26,7 +26,7 @@ def recording() -> bool:
 
 @contextmanager
 def part(name: str) -> Iterator[None]:
-    """Measure the body's time for a part of the command; repeated entries are summed."""
+    """Measure the execution time of the `with` body as a part of the command; repeated parts are summed."""
     if _used is None:
         yield
         return
@@ -36,15 +36,15 @@ def part(name: str) -> Iterator[None]:
     try:
         yield
     finally:
-        whole = time.perf_counter() - start
-        _used[name] += whole - _within.pop()
+        duration = time.perf_counter() - start
+        _used[name] += duration - _within.pop()
         if _within:
-            _within[-1] += whole
+            _within[-1] += duration
 
 
 @contextmanager
 def record() -> Iterator[dict[str, float]]:
-    """Measure the parts of the body; yield their seconds, with the rest."""
+    """Measure the parts of the `with` body; yield their seconds by name, with the remaining time."""
     global _used
     result: dict[str, float] = {}
     _used = result

@@ -5,8 +5,8 @@ Gives: `exact_weight`, `sum_weights`.
 Guarantees: sums are exact, so that 0.1 and 0.2 are 0.3, and 0.1, 0.2 and −0.3 are zero.
 Does not: handle graphs (see `topology.graphs`).
 
-Neutral modes are decided by equality. If a peer's weights of others are 0.1 and 0.2, a rounded sum as its own
-weight would act as a spring to ground.
+Neutral modes are determined by exact equality. For the weights 0.1 and 0.2 of a peer's neighbors, a rounded
+sum as its own weight would act as a spring to ground.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from numpy.typing import NDArray
 
 
 def exact_weight(weight: float) -> Fraction:
-    """Return the shortest decimal that means a float."""
+    """Return the shortest decimal that represents a float, as an exact number."""
     return Fraction(repr(float(weight)))
 
 
 def sum_weights(receivers: NDArray[np.int64], weights: NDArray[np.float64], peers: int) -> NDArray[Any]:
-    """Return the sum of weights of each peer (N,), as `Fraction`.
+    """Return the exact sum of the weights of each peer's incoming arcs (N,), as `Fraction`.
 
     Parameters
     ----------
@@ -35,11 +35,11 @@ def sum_weights(receivers: NDArray[np.int64], weights: NDArray[np.float64], peer
     peers
         The number of peers.
     """
-    different, index = np.unique(weights, return_inverse=True)
-    exact = [exact_weight(weight) for weight in different.tolist()]
+    distinct, index = np.unique(weights, return_inverse=True)
+    exact = [exact_weight(weight) for weight in distinct.tolist()]
     denominator = math.lcm(*(weight.denominator for weight in exact))
-    whole = np.array([int(weight * denominator) for weight in exact], dtype=object)
+    integers = np.array([int(weight * denominator) for weight in exact], dtype=object)
     totals = np.zeros(peers, dtype=object)
-    np.add.at(totals, receivers, whole[index])
+    np.add.at(totals, receivers, integers[index])
     rational = functools.cache(lambda total: Fraction(total, denominator))
     return np.array([rational(total) for total in totals], dtype=object)

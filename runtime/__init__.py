@@ -6,10 +6,11 @@
 
 Each function corresponds to the command of the same name; results are frozen.
 
-The compiler (YAML to CasADi) is `compiler`. Then one folder per subject: `frame` (one peer over one frame) →
-`network` (lost and late packets) → `eigen` (all peers) and `large_scale` (very many peers) → `analysis` →
-`parameter_studies` → `sweeps`, `simulation`, `regions` → `benchmark` → `output` (text, JSON, tables and
-pictures of every result) → `cli`. Each imports only folders before it. A result names its output functions,
+The compiler (YAML to CasADi) is `compiler`. Then one folder per subject: `parameter_values`,
+`linearization`, `timing`, `lifting` (one peer over one frame) → `network` (lost and late packets) →
+`spectrum` (all peers) → `analysis` → `mean_square`, `haptics`, `simulation`, `studies` (many verdicts),
+`regions`, `tuning` → `benchmark` → `output` (text, JSON, tables and pictures of every result) → `cli`. Each
+imports only folders before it. A result names its output functions,
 which are imported when needed.
 """
 
@@ -19,16 +20,16 @@ from typing import Any
 
 def __getattr__(name: str) -> Any:
     if name == "__version__":
-        from apc.distribution import program_version
+        from apc.support.distribution import program_version
 
         return program_version()
     lookup, _, public = _attached()
     if name == "__all__":
         return public
-    from apc.renamed import FUNCTIONS
+    from apc.support.renamed import FUNCTIONS
 
     if name in FUNCTIONS:
-        raise AttributeError(f"apc.{name} is named apc.{FUNCTIONS[name]} now")
+        raise AttributeError(f"unknown function apc.{name}; its present name is apc.{FUNCTIONS[name]}")
     return lookup(name)
 
 
@@ -39,7 +40,9 @@ def __dir__() -> list[str]:
 
 @functools.cache
 def _attached() -> Any:
-    """Import public names on first use: commands do not use them, and import only their own modules."""
+    """Return the lazy loader of the public names: commands do not use them, and import only their own
+    modules.
+    """
     import lazy_loader
 
     return lazy_loader.attach_stub(__name__, __file__)

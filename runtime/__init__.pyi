@@ -1,10 +1,7 @@
 # The public names, each with its home, once: a type checker reads them here, and `__init__.py` looks them up.
 from .analysis.analysis import Analysis as Analysis
-from .analysis.arbitrary_switching import ArbitrarySwitching as ArbitrarySwitching
+from .analysis.box_result import RobustStability as RobustStability
 from .analysis.contact_modes import ContactModes as ContactModes
-from .analysis.event_order import EventOrder as EventOrder
-from .analysis.paper_method import PaperMethod as PaperMethod
-from .analysis.robust_stability import RobustStability as RobustStability
 from .api import (
     absolute_stability as absolute_stability,
 )
@@ -102,25 +99,28 @@ from .api import (
     with_hands as with_hands,
 )
 from .benchmark.speed_and_error import Bench as Bench
-from .comparison.comparison import SchemeComparison as SchemeComparison
 from .compiler.compiled import Model as Model
 from .compiler.errors import ApcError as ApcError
-from .frame.parameter_listing import Parameters as Parameters
+from .extensions.event_order.coincident_events import EventOrder as EventOrder
+from .extensions.paper_method.lifted_matrices import PaperMethod as PaperMethod
+from .extensions.pareto_front.trade_off import Design as Design
+from .extensions.pareto_front.trade_off import ParetoFront as ParetoFront
+from .extensions.switching.arbitrary_switching import ArbitrarySwitching as ArbitrarySwitching
+from .extensions.switching.limit_cycle import LimitCycle as LimitCycle
 from .haptics.absolute_stability import AbsoluteStability as AbsoluteStability
 from .haptics.frequency_response import Transparency as Transparency
 from .mean_square.mean_square_stability import MeanSquareStability as MeanSquareStability
 from .network.link_fit import LinkFit as LinkFit
-from .parameter_studies.batch_analysis import Analyses as Analyses
-from .parameter_studies.critical_values import Critical as Critical
-from .parameter_studies.margins import Margins as Margins
-from .parameter_studies.sensitivity import Sensitivities as Sensitivities
+from .parameter_values.parameter_listing import Parameters as Parameters
 from .regions.stable_region import Region as Region
 from .reports.contents import Report as Report
-from .simulation.limit_cycle import LimitCycle as LimitCycle
 from .simulation.trajectory import Trajectory as Trajectory
-from .sweeps.resumable_sweep import Sweep as Sweep
-from .tuning.pareto_front import Design as Design
-from .tuning.pareto_front import ParetoFront as ParetoFront
+from .studies.batch_analysis import Analyses as Analyses
+from .studies.comparison import SchemeComparison as SchemeComparison
+from .studies.critical_values import Critical as Critical
+from .studies.margins import Margins as Margins
+from .studies.resumable_sweep import Sweep as Sweep
+from .studies.sensitivity import Sensitivities as Sensitivities
 from .tuning.tuner import Tuning as Tuning
 
 __version__: str

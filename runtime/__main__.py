@@ -14,28 +14,28 @@ import sys
 import threading
 from contextlib import suppress
 
-# Every file a command reads or writes has its own message; these can only come from the terminal or a pipe.
+# Errors of files have their own messages; these errors can only come from the terminal or a pipe.
 OUTPUT_ERRORS = (errno.ENOSPC, errno.EIO, errno.EDQUOT, errno.EFBIG)
 
-STOPPED = 130  # the exit code of what Ctrl-C ends: 128 and the number of its signal
+STOPPED = 130  # the exit code after Ctrl-C: 128 plus the number of the signal
 
-# Columns that lines are wrapped to on a narrower terminal, where nothing could be read otherwise.
+# Minimum line width in columns, also on a narrower terminal.
 NARROWEST = 40
 
-# Objects made between two searches for garbage. The 50,000 to 100,000 that imports make all stay: Python's
-# own 700 has them looked through again and again, for a tenth of a short command's time.
-BETWEEN_COLLECTIONS = 100_000
+# Objects created between two garbage collections. Imports create 50,000 to 100,000 permanent objects: with
+# Python's default of 700, repeated collections take a tenth of the time of a short command.
+COLLECTION_THRESHOLD = 100_000
 
 
 def main() -> None:
     """Run the command line and exit."""
-    gc.set_threshold(BETWEEN_COLLECTIONS)
+    gc.set_threshold(COLLECTION_THRESHOLD)
     try:
-        from apc.memory import hold_to_memory
+        from apc.support.memory import hold_to_memory
 
         hold_to_memory()
         code = run(sys.argv[1:])
-    except KeyboardInterrupt:  # while what a command needs is loaded
+    except KeyboardInterrupt:  # while modules are imported
         sys.stderr.write("stopped\n")
         code = STOPPED
     _end(code)
@@ -50,20 +50,22 @@ def _end(code: int) -> None:
         sys.exit(code)
     atexit._run_exitfuncs()
     for stream in (sys.stdout, sys.stderr):
-        with suppress(OSError, ValueError, AttributeError):  # closed, or not writable, as `run` said
+        with suppress(
+            OSError, ValueError, AttributeError
+        ):  # closed, or not writable, which `run` has reported
             stream.flush()
     os._exit(code)
 
 
 def run(arguments: list[str]) -> int:
-    """Run a command and return its exit code; no traceback reaches the terminal."""
+    """Run a command and return its exit code; exceptions are converted to messages."""
     import click
 
     from apc.cli.commands import apc
     from apc.compiler.errors import ApcError, visible
 
-    if sys.stdout is None:  # closed before we began
-        click.echo("apc: the output can't be written: there is no stdout", err=True)
+    if sys.stdout is None:  # closed before the start
+        click.echo("apc: can't write the output: stdout is closed", err=True)
         return 1
     try:
         apc.main(arguments, prog_name="apc", standalone_mode=False)
@@ -80,19 +82,19 @@ def run(arguments: list[str]) -> int:
         click.echo("stopped", err=True)
         return STOPPED
     except SystemExit:
-        # click's answer to a broken pipe, and to nothing else here: whoever reads our output has gone.
+        # click exits this way only for a broken pipe: the reader of the output has ended.
         return 0
     except BrokenPipeError:
-        _silence_stdout()  # likewise, at the last flush
+        _silence_stdout()  # the same at the last flush
         return 0
     except OSError as error:
         if error.errno not in OUTPUT_ERRORS:
             return _bug(arguments)
         _silence_stdout()
-        click.echo(f"apc: the output can't be written: {error.strerror}", err=True)
+        click.echo(f"apc: can't write the output: {error.strerror}", err=True)
         return 1
     except Exception as error:
-        from apc.memory import is_lack, lacking
+        from apc.support.memory import is_lack, lacking
 
         if not is_lack(error):
             return _bug(arguments)
@@ -122,25 +124,26 @@ def _fitting(text: str) -> str:
 
 
 def _silence_stdout() -> None:
-    """Let the flush at exit go nowhere: what could not be written once can't be written twice."""
+    """Redirect the standard output to the null device, so that the flush at exit raises no second error."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _bug(arguments: list[str]) -> int:
-    """Print the location of the report of an internal error."""
+    """Write the report of an internal error, print its location, and return the exit code."""
     import click
 
     where = _report(arguments)
-    click.echo(f"apc: this is a bug of apc, not of your input; a report is in {where}", err=True)
+    click.echo(f"apc: internal error, not an error of the input; report: {where}", err=True)
     return 3
 
 
 def _report(arguments: list[str]) -> str:
+    """Write the report of an internal error to a temporary file, and return the path of the file."""
     import tempfile
     import traceback
     from pathlib import Path
 
-    from apc.distribution import program_version
+    from apc.support.distribution import program_version
 
     text = (
         f"apc {program_version()}, Python {sys.version}\narguments: {arguments}\n\n{traceback.format_exc()}"
@@ -150,7 +153,7 @@ def _report(arguments: list[str]) -> str:
         os.close(handle)
         Path(name).write_text(text, encoding="utf-8")
     except OSError:
-        return f"no file, as none could be written:\n{text}"
+        return f"no file (not writable):\n{text}"
     return name
 
 

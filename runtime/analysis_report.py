@@ -15,41 +15,40 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from apc.analysis.analysis import Analysis, analyze, analyze_sides, near_start
+from apc.analysis.box_result import RobustStability
 from apc.analysis.contact_modes import ContactModes, contact_modes
-from apc.analysis.event_order import EventOrder, event_order
 from apc.analysis.methods import PAPER
 from apc.analysis.one_sided_slopes import Side
 from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
-from apc.frame.numeric_model import Prepared, prepare
-from apc.parameter_studies.margins import NOT_STABLE, Margins, network_margins
-from apc.parameter_studies.margins import margins as margins_of
-from apc.parameter_studies.sensitivity import Sensitivities, network_sensitivities, sensitivities, varied
+from apc.lifting.numeric_model import NumericModel, numeric_model
 from apc.result import Result
-from apc.verdict import StabilityVerdict, Term
+from apc.studies.margins import NOT_STABLE, Margins, network_margins
+from apc.studies.margins import margins as margins_of
+from apc.studies.sensitivity import Sensitivities, network_sensitivities, sensitivities, varied
+from apc.support.extension_table import find_extension, not_installed, require_extension
+from apc.verdict import Note, StabilityVerdict, Term
 
 if TYPE_CHECKING:
-    from apc.analysis.arbitrary_switching import ArbitrarySwitching
-    from apc.analysis.robust_stability import RobustStability
-    from apc.frame.parameter_names import Range
     from apc.mean_square.mean_square_stability import MeanSquareStability
-    from apc.simulation.limit_cycle import LimitCycle
+    from apc.parameter_values.parameter_names import Range
 
-# How far the radius that is differentiated may be from that of the analysis, relative to 1: roundings of a
-# well-conditioned frame stay below 1e-12; beyond ten times that, floats lose the digits of derivatives.
+# The largest difference between the spectral radius of the sensitivities and that of the analysis, relative
+# to 1: rounding errors of a well-conditioned frame map are below 1e-12; above ten times this, derivatives are
+# inaccurate.
 SAME_RADIUS = 1e-11
 
-# More peers than this, if different or on a graph, are too many for default sensitivities.
+# The largest number of different peers, or peers on a graph, for sensitivities by default.
 FEW_PEERS = 100
 
-# What is varied is composed hundreds of times, tick by tick: with more ticks in a frame for over ten seconds.
-# Each number costs products of matrices of all states: with more of these together, for as long.
+# Limits above which sensitivities and margins take more than ten seconds: ticks of a frame, whose map is
+# composed hundreds of times, and multiplications of matrix products for all varied parameters.
 MOST_TICKS, MOST_PRODUCTS = 500, 1_000_000_000
 
 
 @dataclass(frozen=True, slots=True)
 class NetworkAnswer(Result):
-    """The verdict over the lossy network, with the sensitivities and margins of the mean-square growth."""
+    """The verdict over the lossy network, with sensitivities and margins of the mean-square growth."""
 
     shown_by = "analysis_output:network_answer"
 
@@ -60,15 +59,16 @@ class NetworkAnswer(Result):
 
 @dataclass(frozen=True, slots=True)
 class AnalysisReport(Result):
-    """An analysis with its sensitivities, margins, and modes of contact.
+    """An analysis with its sensitivities, margins, and contact modes.
 
-    `event_order` holds the analyses under every order of coincident events, or under those available at
-    little cost; `detailed` is whether they were requested. `box` is the proof over a box of parameters, if
-    requested. `network` is the verdict over the lossy network, with the sensitivities and margins of the
-    mean-square growth; None if all packets are on time. `arbitrary_switching` is the result for arbitrary
-    switching of contacts, None without contacts; `limit_cycle` is None if not requested or not predictable,
-    with the reason in `no_limit_cycle`. `warnings` are those of the topology. `nominal` is whether the text
-    includes all results of the nominal network.
+    `event_order` has the analyses under every order of coincident events, if requested; `order_warning`
+    states in any case whether the verdict depends on it, as far as this costs little. `box` is the proof over
+    a box of parameters, if requested. `network` is the verdict over the lossy network, with the sensitivities
+    and margins of the mean-square growth; None if all packets are on time. `arbitrary_switching` is the
+    result for arbitrary switching of contacts, None without contacts; `limit_cycle` is None if not requested
+    or not predictable, with the reason in `no_limit_cycle`. `warnings` are those of the topology. `nominal`
+    is whether the text includes all results of the nominal network, `all_modes` whether it has a row for
+    every mode.
     """
 
     shown_by = "analysis_output:answer"
@@ -78,49 +78,44 @@ class AnalysisReport(Result):
     sensitivities: Sensitivities
     margins: Margins
     contact_modes: ContactModes | None
-    arbitrary_switching: ArbitrarySwitching | None
-    limit_cycle: LimitCycle | None
-    event_order: EventOrder
-    detailed: bool
+    arbitrary_switching: Result | None
+    limit_cycle: Result | None
+    event_order: Result | None
+    order_warning: str
     box: RobustStability | None
     no_limit_cycle: str = ""
     warnings: tuple[str, ...] = ()
     nominal: bool = False
+    all_modes: bool = False
 
 
-def analysis_report(
-    system: Model, *, method: str = "auto", certify: bool = False, prepared: Prepared | None = None
-) -> Analysis:
-    """Analyse a system by one of the methods of `analysis.analyze`, or "paper" (see `paper_method`).
+def analysis_report(numeric: NumericModel, *, method: str = "auto", certify: bool = False) -> Analysis:
+    """Return the analysis of a system by a method of `analysis.analyze`, or by "paper" (see `paper_method`).
 
     Parameters
     ----------
-    system
-        The model, with the parameter values to analyze.
+    numeric
+        The model with its parameter values.
     method
-        The method.
+        The name of the method.
     certify
         Prove the verdict in ball arithmetic.
-    prepared
-        From `numeric_model.prepare`, of this model with any parameter values.
     """
-    return _run_method(system, prepared or prepare(system), method=method, certify=certify)[0]
+    return _run_method(numeric, method=method, certify=certify)[0]
 
 
-def _run_method(system: Model, prepared: Prepared, *, method: str, certify: bool) -> tuple[Analysis, Side]:
-    """Return the analysis of the worst side of the kinks at which peers start, and that side."""
+def _run_method(numeric: NumericModel, *, method: str, certify: bool) -> tuple[Analysis, Side]:
+    """Return the analysis on the worst side of the kinks at the start values, and this side."""
+    system = numeric.model
     if method != PAPER:
-        return analyze_sides(system, method=method, certify=certify, prepared=prepared)
+        return analyze_sides(numeric, method=method, certify=certify)
     if certify:
-        message = "method paper gives no proof: its matrices hold every sample of a frame, rounded"
+        message = "method paper has no proof, because its matrices are rounded"
         raise ApcError(
-            Diagnostic(
-                "E850", SourceLocation(system.origin.topology), message, hint="--method auto --certify"
-            )
+            Diagnostic("E850", SourceLocation(system.origin.topology), message, fix="--method auto --certify")
         )
-    from apc.analysis.paper_method import analyze_paper  # rarely asked for
-
-    return analyze_paper(system), Side("", system, prepared)
+    paper_analysis: Analysis = require_extension("paper_method").analyze_paper(system)
+    return paper_analysis, Side("", numeric)
 
 
 def answer(
@@ -134,7 +129,7 @@ def answer(
     margins: bool | None = None,
     with_limit_cycle: bool = False,
 ) -> AnalysisReport:
-    """Analyze a system, with the additional results of `apc analyze`.
+    """Return the analysis of a system, with the additional results of `apc analyze`.
 
     Parameters
     ----------
@@ -145,92 +140,117 @@ def answer(
     certify
         Prove the verdict in ball arithmetic.
     box
-        Ranges of parameters over which to prove stability as well.
+        Ranges of parameters over which stability is to be proved.
     cells
         The largest number of cells of the box, see `robust_stability`.
     every_convention
-        Repeat the analysis under every order of coincident events, however long it takes.
+        Whether to repeat the analysis under every order of coincident events, without a time limit.
     margins
-        Whether to compute margins: True for all, however long it takes; False for none; None for all if that
+        Whether to compute margins: True for all, without a time limit; False for none; None for all if this
         takes about a second.
     with_limit_cycle
-        Predict the limit cycle of one-sided contacts, and simulate it for comparison.
+        Whether to predict the limit cycle of one-sided contacts, and simulate it for comparison.
 
     Raises
     ------
     ApcError
         As `analysis.analyze` and `robust_stability.prove_robust_stability`.
     """
-    prepared = prepare(system)
-    analysis, side = _run_method(system, prepared, method=method, certify=certify)
-    modes, notes = _contact_modes(system, prepared)
-    compared = event_order(system, prepared=prepared, default=analysis, quick=not every_convention)
-    if compared.not_repeated and not every_convention:
-        notes = (*notes, compared.not_repeated)
-    moved = sensitivities_of(side.system, side.prepared, analysis)
-    nominal = _margins(system, prepared, analysis, requested=margins)
-    limit_cycle, no_limit_cycle = _limit_cycle(system, prepared) if with_limit_cycle else (None, "")
+    numeric = numeric_model(system)
+    analysis, side = _run_method(numeric, method=method, certify=certify)
+    modes, notes = _contact_modes(numeric)
+    orders, order_warning, order_notes = _event_orders(numeric, analysis, every=every_convention)
+    sensitivity_result = sensitivities_of(side.numeric, analysis)
+    nominal = _margins(numeric, analysis, requested=margins)
+    limit_cycle, no_limit_cycle = _limit_cycle(numeric) if with_limit_cycle else (None, "")
+    switching = _switching(numeric, modes) if modes else None
+    if modes and switching is None:
+        notes = (*notes, not_installed("switching"))
     return AnalysisReport(
-        analysis=replace(analysis, notes=(*analysis.notes, *notes, *_published(system))),
-        network=_over_network(system, prepared, analysis, nominal, certify=certify, requested=margins),
-        sensitivities=moved,
+        analysis=replace(
+            analysis, notes=(*analysis.notes, *notes, *order_notes, *_published_conditions(system))
+        ),
+        network=_over_network(numeric, analysis, nominal, certify=certify, requested=margins),
+        sensitivities=sensitivity_result,
         margins=nominal,
         contact_modes=modes,
-        arbitrary_switching=_switching(system, prepared, modes) if modes else None,
+        arbitrary_switching=switching,
         limit_cycle=limit_cycle,
-        event_order=compared,
-        detailed=every_convention,
+        event_order=orders,
+        order_warning=order_warning,
         box=robust_stability(system, box, cells=cells) if box else None,
         no_limit_cycle=no_limit_cycle,
         warnings=system.warnings,
     )
 
 
-def _published(system: Model) -> tuple[str, ...]:
-    """Return published conditions; imported here, as few topologies have an element they are about."""
+def _event_orders(
+    numeric: NumericModel, analysis: Analysis, *, every: bool
+) -> tuple[Result | None, str, tuple[Note, ...]]:
+    """Return the analyses under every order of coincident events, a warning if they differ, and notes.
+
+    The first is None unless every order is requested.
+    """
+    extension = require_extension("event_order") if every else find_extension("event_order")
+    if extension is None:
+        return None, "", (not_installed("event_order"),)
+    orders = extension.event_order(numeric, default=analysis, quick=not every)
+    if every:
+        return orders, "", ()
+    return None, orders.warning, (orders.not_repeated,) if orders.not_repeated else ()
+
+
+def _published_conditions(system: Model) -> tuple[str, ...]:
+    """Return the texts of published conditions; imported here, as few topologies have such parts."""
     from apc.haptics.published_limits import published_limits
 
     return published_limits(system)
 
 
 def _over_network(
-    system: Model,
-    prepared: Prepared,
+    numeric: NumericModel,
     analysis: Analysis,
     nominal: Margins,
     *,
     certify: bool,
     requested: bool | None,
 ) -> NetworkAnswer | None:
-    """Return the result over the lossy network; imported here, as most models have an ideal one."""
-    if all(link.channel is None for link in system.links):
+    """Return the result over the lossy network, None for an ideal one.
+
+    The module is imported here, as most networks are ideal.
+    """
+    if all(link.channel is None for link in numeric.model.links):
         return None
     from apc.mean_square.mean_square_stability import mean_square_stability
 
-    verdict = mean_square_stability(system, prepared, certify=certify)
+    verdict = mean_square_stability(numeric, certify=certify)
     if verdict is None:
         return None
-    if why := _too_large(system, prepared, analysis) or _too_many_products(system):
+    if why := _too_large(numeric, analysis) or _too_many_products(numeric.model):
         return NetworkAnswer(verdict, _not_reported(0.0, why), Margins((), why))
-    moved = network_sensitivities(system, prepared)
+    network_derivatives = network_sensitivities(numeric)
     if requested is False:
-        return NetworkAnswer(verdict, moved, nominal)
-    return NetworkAnswer(verdict, moved, network_margins(system, prepared, nominal, quick=not requested))
+        return NetworkAnswer(verdict, network_derivatives, nominal)
+    return NetworkAnswer(verdict, network_derivatives, network_margins(numeric, nominal, quick=not requested))
 
 
-def _switching(system: Model, prepared: Prepared, modes: ContactModes) -> ArbitrarySwitching:
-    """Return the result for arbitrary switching; imported here, as most models have no contacts."""
-    from apc.analysis.arbitrary_switching import arbitrary_switching
+def _switching(numeric: NumericModel, modes: ContactModes) -> Result | None:
+    """Return the result for arbitrary switching of contacts, None without the extension."""
+    extension = find_extension("switching")
+    if extension is None:
+        return None
+    result: Result = extension.arbitrary_switching(numeric, modes)
+    return result
 
-    return arbitrary_switching(system, modes, prepared=prepared)
 
+def _limit_cycle(numeric: NumericModel) -> tuple[Result | None, str]:
+    """Return the predicted limit cycle of contacts, or None and the reason.
 
-def _limit_cycle(system: Model, prepared: Prepared) -> tuple[LimitCycle | None, str]:
-    """Return the buzz of contacts, or why there is none; imported here, as few analyses ask for it."""
-    from apc.simulation.limit_cycle import limit_cycle
-
+    Raises ApcError (E882) without the extension.
+    """
+    extension = require_extension("switching")
     try:
-        return limit_cycle(system, prepared=prepared), ""
+        return extension.limit_cycle(numeric), ""
     except ApcError as error:
         return None, error.mistakes[0].reason
 
@@ -243,7 +263,9 @@ def robust_stability(
     cells: int | None = None,
     inside: float = 1.0,
 ) -> RobustStability:
-    """Return the proof over a box; imported here, as few analyses request one.
+    """Return the proof of stability over a box of parameters.
+
+    The module of the proof is imported here, as it is rarely required.
 
     Parameters
     ----------
@@ -252,37 +274,38 @@ def robust_stability(
     box
         Ranges of parameters.
     passive
-        Whether the criterion is every passive hand, over the nominal network: for ranges of a link's delay
-        only.
+        Whether the criterion is stability with every passive hand, over the nominal network: only for ranges
+        of a link's delay.
     cells
-        The largest number of cells; by default as many as take some seconds.
+        The largest number of cells; by default a number that takes some seconds.
     inside
         The upper limit of the spectral radius, over a network with all packets on time.
 
     Raises
     ------
     ApcError
-        As `robust_stability.prove_robust_stability`, or `mean_square.mean_square_box.prove_mean_square`
-        where links are, or may become, unreliable; E930 other ranges, with every passive hand.
+        As `robust_stability.prove_robust_stability`, or `mean_square_box.prove_mean_square` if links
+        are, or may become, unreliable; E930 other ranges than a delay, with every passive hand; E882 without
+        the extension.
     """
     from apc.network.nominal_criterion import channel_numbers, unreliable
-    from apc.parameter_studies.delay_interval_proof import is_delay, prove_over_delay
+    from apc.studies.representative_delays import is_delay
 
     if passive and not (len(box) == 1 and is_delay(system, box[0].free)):
-        message = "with every passive hand values are judged one by one, and of ranges that of a link's delay"
-        hint = "apc region --hands passive, or apc critical --hands passive"
-        raise ApcError(Diagnostic("E930", SourceLocation("--box"), message, hint=hint))
+        message = "with passive operators only a range of a link delay can be in a box"
+        fix = "apc region --hands passive, or apc critical --hands passive"
+        raise ApcError(Diagnostic("E930", SourceLocation("--box"), message, fix=fix))
+    extension = require_extension("parameter_boxes")
+    result: RobustStability
     if any(is_delay(system, interval.free) for interval in box):
         at_each = partial(proved_at, passive=passive, cells=cells, inside=inside)
-        return prove_over_delay(system, box, at_each, nominal=not passive and not unreliable(system))
-    from apc.analysis.robust_stability import prove_robust_stability
-
-    numbers = channel_numbers(system)
-    if unreliable(system) or any(interval.free.name in numbers for interval in box):
-        from apc.mean_square.mean_square_box import prove_mean_square as prove_over_network
-
-        return prove_over_network(system, box, cells=cells)
-    return prove_robust_stability(system, box, cells=cells, inside=inside)
+        nominal = not passive and not unreliable(system)
+        result = extension.prove_over_delay(system, box, at_each, nominal=nominal)
+    elif unreliable(system) or any(interval.free.name in channel_numbers(system) for interval in box):
+        result = extension.prove_mean_square(system, box, cells=cells)
+    else:
+        result = extension.prove_robust_stability(system, box, cells=cells, inside=inside)
+    return result
 
 
 def proved_at(
@@ -293,7 +316,7 @@ def proved_at(
     cells: int | None = None,
     inside: float = 1.0,
 ) -> RobustStability:
-    """Return the proof over a box; without ranges, the verdict.
+    """Return the proof over a box; for an empty box the verdict for the parameter values.
 
     Parameters
     ----------
@@ -302,104 +325,106 @@ def proved_at(
     """
     if box:
         return robust_stability(system, box, passive=passive, cells=cells, inside=inside)
-    from apc.analysis.robust_stability import RobustStability
     from apc.network.nominal_criterion import unreliable
 
     verdict: Term
     if passive:
         from apc.haptics.absolute_stability import absolute_stability
 
-        hands = absolute_stability(system)
-        verdict, stable, left = hands.verdict, hands.stable, hands.limitations
+        hands = absolute_stability(numeric_model(system))
+        verdict, stable, limitations = hands.verdict, hands.stable, hands.limitations
     elif unreliable(system):
         from apc.mean_square.mean_square_stability import mean_square_stability
 
-        prepared = prepare(system)
-        network = mean_square_stability(system, prepared)
+        numeric = numeric_model(system)
+        network = mean_square_stability(numeric)
         assert network is not None, "a link is unreliable"
-        verdict, stable, left = network.verdict, network.stable, near_start(system, prepared)
+        verdict, stable, limitations = network.verdict, network.stable, near_start(numeric)
     else:
-        analysis = analyze(system)
-        verdict, stable, left = analysis.verdict, analysis.stable, analysis.limitations
+        analysis = analyze(numeric_model(system))
+        verdict, stable, limitations = analysis.verdict, analysis.stable, analysis.limitations
         if stable and inside != 1 and not analysis.spectral_radius + analysis.spectral_radius_error < inside:
             stable = False if analysis.spectral_radius - analysis.spectral_radius_error >= inside else None
-    return RobustStability(system.name, (), verdict, stable, 1, float(stable is None), (), (), left)
+    return RobustStability(system.name, (), verdict, stable, 1, float(stable is None), (), (), limitations)
 
 
-def sensitivities_of(system: Model, prepared: Prepared, analysis: Analysis) -> Sensitivities:
-    """Return the sensitivities of an analysis, or the reason for their absence.
+def sensitivities_of(numeric: NumericModel, analysis: Analysis) -> Sensitivities:
+    """Return the sensitivities of an analysis, or an empty result with the reason.
 
     Parameters
     ----------
-    system, prepared
-        The model, and the result of `numeric_model.prepare`.
+    numeric
+        The model with its parameter values.
     analysis
-        Its analysis.
+        The analysis of the model.
     """
-    if why := _too_large(system, prepared, analysis) or _too_many_products(system):
+    if why := _too_large(numeric, analysis) or _too_many_products(numeric.model):
         return _not_reported(analysis.spectral_radius, why)
     try:
-        moved = sensitivities(system, prepared=prepared)
+        result = sensitivities(numeric)
     except ApcError as error:
-        return _not_reported(analysis.spectral_radius, f"not looked for: {error.mistakes[0].message}")
-    # Derivatives are of matrices in floats, the analysis is of exact exponentials: both have one radius.
-    separation = abs(moved.radius - analysis.spectral_radius) - analysis.spectral_radius_error
-    if moved.active and not separation <= SAME_RADIUS * max(1.0, analysis.spectral_radius):
-        why = "not told: floats lose the digits of what would be differentiated"
+        return _not_reported(analysis.spectral_radius, f"not computed: {error.mistakes[0].message}")
+    # The matrices of the derivatives are rounded, the analysis is exact: both must have the same spectral
+    # radius.
+    difference = abs(result.radius - analysis.spectral_radius) - analysis.spectral_radius_error
+    if result.active and not difference <= SAME_RADIUS * max(1.0, analysis.spectral_radius):
+        why = "not computed: rounding dominates the derivative"
         return _not_reported(analysis.spectral_radius, why)
-    return moved
+    return result
 
 
 def _not_reported(radius: float, why: str) -> Sensitivities:
-    return Sensitivities(radius, (), (), f"what moves it most: {why}")
+    """Return an empty result of sensitivities, with the reason."""
+    return Sensitivities(radius, (), (), f"sensitivities {why}")
 
 
-def _too_large(system: Model, prepared: Prepared, analysis: Analysis) -> str:
-    """Return the reason for omitting margins, "" for few small matrices and short frames."""
-    if why := _too_many_peers(system, analysis):
+def _too_large(numeric: NumericModel, analysis: Analysis) -> str:
+    """Return the reason for omitting margins; empty for few peers and short frames."""
+    if why := _too_many_peers(numeric.model, analysis):
         return why
-    ticks = max(sum(schedule.ticks) for schedule in prepared.schedules)
+    ticks = max(sum(schedule.ticks) for schedule in numeric.schedules)
     if ticks > MOST_TICKS:
-        return f"not looked for: {ticks:,} ticks in a frame take too long"
-    packets = max(len(schedule.received) for schedule in prepared.schedules)
+        return f"not computed: {ticks:,} ticks in a frame take too long"
+    packets = max(len(schedule.received) for schedule in numeric.schedules)
     if packets > MOST_TICKS:
-        return f"not looked for: {packets:,} packets heard in a frame take too long"
+        return f"not computed: {packets:,} received packets in a frame take too long"
     return ""
 
 
 def _too_many_peers(system: Model, analysis: Analysis) -> str:
-    """Return the reason for omitting sensitivities; "" unless very many peers differ or are on a graph."""
+    """Return the reason for omitting sensitivities; empty unless very many peers differ or are on a graph."""
     complete = all(link.graph.shape == "complete" for link in system.links)
-    separation = analysis.method == "determinant" or not complete
-    return "not looked for in so large a population" if separation and system.peers > FEW_PEERS else ""
+    irregular = analysis.method == "determinant" or not complete
+    return "not computed for a population of this size" if irregular and system.peers > FEW_PEERS else ""
 
 
 def _too_many_products(system: Model) -> str:
-    """Return the reason for omitting derivatives, "" unless there are many parameters and states."""
+    """Return the reason for omitting derivatives; empty unless parameters and states are very many."""
     free, states = len(varied(system)), max(len(peer_type.states) for peer_type in system.peer_types)
     if free * states**3 > MOST_PRODUCTS:
-        return f"not looked for: {free:,} numbers of {states:,} states take too long"
+        return f"not computed: {free:,} parameters and {states:,} states take too long"
     return ""
 
 
-def _margins(system: Model, prepared: Prepared, analysis: Analysis, *, requested: bool | None) -> Margins:
-    """Return the margins, or only why they couldn't be had."""
+def _margins(numeric: NumericModel, analysis: Analysis, *, requested: bool | None) -> Margins:
+    """Return the stability margins, or an empty result with the reason."""
     if requested is False:
-        return Margins((), "not looked for: they were not wanted")
+        return Margins((), "not requested")
     if analysis.stable is None or analysis.verdict is StabilityVerdict.UNSTABLE:
         return Margins((), NOT_STABLE.format("proved stable" if analysis.stable is None else "stable"))
-    if why := _too_many_peers(system, analysis):
+    if why := _too_many_peers(numeric.model, analysis):
         return Margins((), why)
     try:
-        return margins_of(system, prepared=prepared, quick=not requested)
+        known = None if analysis.method == PAPER else analysis  # its matrices are rounded
+        return margins_of(numeric, quick=not requested, analysis=known)
     except ApcError as error:
-        return Margins((), f"not looked for: {error.mistakes[0].message}")
+        return Margins((), f"not computed: {error.mistakes[0].message}")
 
 
-def _contact_modes(system: Model, prepared: Prepared) -> tuple[ContactModes | None, tuple[str, ...]]:
-    """Return the modes of contact, None without contacts, and a note if they are unavailable."""
+def _contact_modes(numeric: NumericModel) -> tuple[ContactModes | None, tuple[Note, ...]]:
+    """Return the contact modes, None without contacts, and a note if they are not available."""
     try:
-        modes = contact_modes(system, prepared=prepared)
+        modes = contact_modes(numeric)
     except ApcError as error:
         return None, (f"modes of contact: {error.mistakes[0].sentence}",)
     return (modes if modes.modes else None), ()

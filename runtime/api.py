@@ -1,8 +1,8 @@
-"""The public functions: plain, with frozen results.
+"""The public functions, one for each command, with frozen results.
 
 Takes: paths, compiled models, settings.
 Gives: compiled models and analyses; `show`, `schema`.
-Guarantees: what a command does, the function of its name does.
+Guarantees: a function has the same result as the command with its name.
 Does not: print.
 """
 
@@ -13,37 +13,39 @@ from numbers import Integral, Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from apc.arguments import checked
 from apc.compiler import store
 from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
+from apc.support.arguments import checked
+from apc.support.extension_table import require_extension
 
 if TYPE_CHECKING:
     from apc.analysis.analysis import Analysis
-    from apc.analysis.arbitrary_switching import ArbitrarySwitching
+    from apc.analysis.box_result import RobustStability
     from apc.analysis.contact_modes import ContactModes
-    from apc.analysis.event_order import EventOrder
     from apc.analysis.methods import Method
-    from apc.analysis.paper_method import PaperMethod
-    from apc.analysis.robust_stability import RobustStability
     from apc.benchmark.speed_and_error import Bench
-    from apc.comparison.comparison import SchemeComparison
-    from apc.frame.parameter_listing import Parameters
+    from apc.extensions.event_order.coincident_events import EventOrder
+    from apc.extensions.paper_method.lifted_matrices import PaperMethod
+    from apc.extensions.pareto_front.trade_off import ParetoFront
+    from apc.extensions.switching.arbitrary_switching import ArbitrarySwitching
+    from apc.extensions.switching.limit_cycle import LimitCycle
     from apc.haptics.absolute_stability import AbsoluteStability
     from apc.haptics.frequency_response import Transparency
+    from apc.lifting.numeric_model import NumericModel
     from apc.mean_square.mean_square_stability import MeanSquareStability
     from apc.network.link_fit import LinkFit
-    from apc.parameter_studies.batch_analysis import Analyses
-    from apc.parameter_studies.critical_values import Critical
-    from apc.parameter_studies.margins import Margins
-    from apc.parameter_studies.sensitivity import Sensitivities
+    from apc.parameter_values.parameter_listing import Parameters
     from apc.regions.stable_region import Region
     from apc.reports.contents import Report
     from apc.result import Result
-    from apc.simulation.limit_cycle import LimitCycle
     from apc.simulation.trajectory import Trajectory
-    from apc.sweeps.resumable_sweep import Sweep
-    from apc.tuning.pareto_front import ParetoFront
+    from apc.studies.batch_analysis import Analyses
+    from apc.studies.comparison import SchemeComparison
+    from apc.studies.critical_values import Critical
+    from apc.studies.margins import Margins
+    from apc.studies.resumable_sweep import Sweep
+    from apc.studies.sensitivity import Sensitivities
     from apc.tuning.specification import TuningSpec
     from apc.tuning.tuner import Tuning
 
@@ -55,7 +57,7 @@ Criterion = Literal["mean-square", "nominal", "passive"]
 
 @checked
 def compile(path: str | Path) -> Model:
-    """Compile a topology file.
+    """Return the compiled model of a topology file.
 
     Parameters
     ----------
@@ -70,10 +72,10 @@ def compile(path: str | Path) -> Model:
     Raises
     ------
     ApcError
-        The file is invalid; holds every mistake found.
+        The file is invalid; the error contains all mistakes.
     """
     from apc.compiler.pipeline import compile_topology
-    from apc.frame.start_checks import check_values
+    from apc.lifting.start_checks import check_values
 
     system = compile_topology(Path(path))
     check_values(system)
@@ -82,64 +84,70 @@ def compile(path: str | Path) -> Model:
 
 @checked
 def save(model: Model, path: str | Path) -> None:
-    """Write a compiled model to a .apc file, whole or not at all. Raises ApcError if it can't be written."""
+    """Write a compiled model to a .apc file, completely or not at all.
+
+    Raises ApcError if it can't be written.
+    """
     store.save(model, Path(path))
 
 
 @checked
 def load(path: str | Path) -> Model:
-    """Read a compiled model from a .apc file. Raises ApcError if it is damaged or older than its topology."""
-    from apc.inputs import load_fresh
+    """Return the compiled model in a .apc file.
+
+    Raises ApcError if the file is damaged, or if its topology has changed.
+    """
+    from apc.inputs.open_model import load_fresh
 
     return load_fresh(Path(path))
 
 
 @checked
 def with_hands(model: TopologySource, hands: str) -> Model:
-    """Return the model with hands at all devices.
+    """Return the model with a hand at every device.
 
     Parameters
     ----------
     model
         As for `analyze`.
     hands
-        "clamped": they are held fast; "held": a hand of `hand.mass`, `hand.damping` and `hand.stiffness`
-        each, 0 until set; or a hand of the library, such as "StylusArmForward".
+        "clamped": the devices are fixed; "held": a hand with `hand.mass`, `hand.damping` and `hand.stiffness`
+        at each device, 0 by default; or a hand of the library, such as "StylusArmForward".
 
     Raises
     ------
     ApcError
-        No such hands, a peer without a device, or with a hand already. E930 "passive", which are all
-        hands there are: `absolute_stability`, `critical` and `region` judge them.
+        Unknown hands, a peer without a device, or a peer that already has a hand. E930 "passive", which
+        represents all passive hands: see `absolute_stability`, `critical` and `region`.
     """
-    from apc.frame import devices
+    from apc.lifting import devices
 
     changed = devices.with_hands(_model(model, None), hands)
     if hands == devices.PASSIVE:
-        message = "passive hands are all that draw no energy, and a model has one hand a device"
+        message = "passive hands are a set of operators, not a model of one hand"
         raise ApcError(
-            Diagnostic("E930", SourceLocation("with_hands"), message, hint="apc.absolute_stability(model)")
+            Diagnostic("E930", SourceLocation("with_hands"), message, fix="apc.absolute_stability(model)")
         )
     return changed
 
 
 @checked
 def set_parameters(model: Model, values: Mapping[str, str | float]) -> Model:
-    """Return the model with other parameter values, without compiling again.
+    """Return the model with other parameter values, without recompilation.
 
     Parameters
     ----------
     model
-        The compiled model; it is not changed.
+        The compiled model, which remains unchanged.
     values
-        Quantities by name, or numbers in SI: `{"contact.stiffness": "800 N/m", "lan.delay": 0.016}`.
+        Quantities or numbers in SI units, by name: `{"contact.stiffness": "800 N/m", "lan.delay": 0.016}`.
 
     Raises
     ------
     ApcError
-        A name is unknown, a unit is wrong, or a value lies outside its bounds.
+        A name is unknown, a unit is wrong, or a value is outside its bounds.
     """
-    from apc.frame.overrides import apply, parse_override
+    from apc.parameter_values.overrides import apply, parse_override
 
     overrides = [
         parse_override(model, f"{name}={_quantity(model, name, value)}") for name, value in values.items()
@@ -148,21 +156,21 @@ def set_parameters(model: Model, values: Mapping[str, str | float]) -> Model:
 
 
 def _quantity(system: Model, name: str, value: str | float) -> str:
-    """Return a parameter value as text; a number without a unit is in SI."""
+    """Return a parameter value as text; a number is in SI units."""
     if isinstance(value, str):
         return value
-    from apc.frame.parameter_names import find, unit_of
+    from apc.parameter_values.parameter_names import find, unit_of
 
     if not isinstance(value, Real) or isinstance(value, bool):
         raise ApcError(
-            Diagnostic("E204", SourceLocation(name), name, "a quantity or a number in SI", repr(value)[:80])
+            Diagnostic("E204", SourceLocation(name), name, "a quantity or an SI number", repr(value)[:80])
         )
     number = int(value) if isinstance(value, Integral) else float(value)
     return f"{number!r} {unit_of(system, find(system, name, counts=True).name)}".rstrip()
 
 
 def _range(system: Model, name: str, value: str | Sequence[str | float]) -> str:
-    """Return a parameter range as text, from a text or its two ends."""
+    """Return a parameter range as text, from a text or from the two ends."""
     return value if isinstance(value, str) else ":".join(_quantity(system, name, end) for end in value)
 
 
@@ -174,7 +182,7 @@ def analyze(
     method: Method = "auto",
     certify: bool = False,
 ) -> Analysis:
-    """Analyze the stability of a model: verdict, spectral radius, and modes.
+    """Return the stability analysis of a model: verdict, spectral radius, and modes.
 
     Parameters
     ----------
@@ -183,12 +191,12 @@ def analyze(
     params
         Parameter values to change first, as in `set_parameters`.
     method
-        "auto": the method suited to the model; "modes": a few systems of one peer's size, at a cost that
-        does not grow with the number of equal peers; "dense": every peer in one system, the check on the
-        others; "determinant": the zeros of a small determinant, for peers that all differ and for long
+        "auto": selected by the model; "modes": a few systems of the size of one peer, at a cost
+        independent of the number of equal peers; "dense": all peers in one system, as a check of the
+        other methods; "determinant": the zeros of a small determinant, for peers that all differ and for long
         delays; "paper": the lifted matrices of Rakhsha and Constantinescu, eqs. (18) to (20).
     certify
-        Prove the verdict in ball arithmetic.
+        Whether to prove the verdict in ball arithmetic.
 
     Returns
     -------
@@ -202,7 +210,7 @@ def analyze(
     """
     from apc.analysis_report import analysis_report
 
-    return analysis_report(_model(model, params), method=method, certify=certify)
+    return analysis_report(_numeric(model, params), method=method, certify=certify)
 
 
 @checked
@@ -212,20 +220,20 @@ def analyze_many(
     *,
     params: Values | None = None,
 ) -> Analyses:
-    """Analyze a model at many parameter values at once, a hundred times as fast as one by one.
+    """Return the analyses of a model at many parameter values, about 100 times faster than single analyses.
 
     Parameters
     ----------
     model, params
         As for `analyze`.
     values
-        By parameter an array of its values, numbers in SI or quantities: {"contact.stiffness": [500, 1000],
-        "lan.delay": ["8 ms", "16 ms"]}. Arrays are broadcast against one another.
+        Arrays of values by parameter, numbers in SI units or quantities: {"contact.stiffness": [500, 1000],
+        "lan.delay": ["8 ms", "16 ms"]}. Arrays are broadcast against each other.
 
     Returns
     -------
     Analyses
-        Arrays of that shape: `.verdict`, `.stable`, `.spectral_radius` with its bound
+        Arrays of the common shape: `.verdict`, `.stable`, `.spectral_radius` with its bound
         `.spectral_radius_error`, `.frequency_hz` and `.damping_ratio` of the dominant mode;
         `.to_dataframe()`.
 
@@ -234,7 +242,7 @@ def analyze_many(
     ApcError
         The input is invalid; the error of a single point is in its `.message`.
     """
-    from apc.parameter_studies import batch_analysis
+    from apc.studies import batch_analysis
 
     return batch_analysis.analyze_many(_model(model, params), values)
 
@@ -249,27 +257,27 @@ def critical(
     upper: str | float | None = None,
     criterion: Criterion | None = None,
 ) -> Critical:
-    """Find the values of a parameter or delay at which a model becomes stable or unstable.
+    """Return the values of a parameter or delay at which a model becomes stable or unstable.
 
     Parameters
     ----------
     model, params
         As for `analyze`.
     parameter
-        Its name, such as "coordination.stiffness" or "lan.delay".
+        The name of the parameter, such as "coordination.stiffness" or "lan.delay".
     lower, upper
-        The ends of the search range, such as "5000 N/m", or numbers in SI.
+        The ends of the search range, such as "5000 N/m", or numbers in SI units.
     criterion
         "mean-square": second moments decay over the lossy network, the default if a link loses or delays
-        packets; "nominal": motions decay if every packet is on time; "passive": they decay with every passive
-        hand at every device.
+        packets; "nominal": motions decay if every packet is on time; "passive": motions decay with every
+        passive hand at every device.
 
     Raises
     ------
     ApcError
         The input is invalid.
     """
-    from apc.parameter_studies import critical_values
+    from apc.studies import critical_values
 
     system = _model(model, params)
     low, high = (None if item is None else _quantity(system, parameter, item) for item in (lower, upper))
@@ -285,16 +293,17 @@ def compare(
     criterion: Criterion | None = None,
     at: str = "",
 ) -> SchemeComparison:
-    """Compare schemes: verdicts, largest stable stiffness, delay and loss, transparency, cost.
+    """Return the comparison of schemes: verdicts, largest stable stiffness, delay and loss,
+    transparency, cost.
 
     Parameters
     ----------
     models
         Models as for `analyze`, usually several.
     params
-        As for `analyze`, of all of them.
+        As for `analyze`, for all models.
     over
-        The varied stiffness, delay and loss, if a model has several; each uses those it has.
+        The varied stiffness, delay and loss, if a model has several; each model uses its own of these.
     criterion
         As for `critical`.
     at
@@ -311,7 +320,7 @@ def compare(
     ApcError
         The input is invalid.
     """
-    from apc.comparison import comparison
+    from apc.studies import comparison
 
     topologies = _several(models, "compare")
     return comparison.compare(
@@ -321,7 +330,7 @@ def compare(
 
 @checked
 def absolute_stability(model: TopologySource, *, params: Values | None = None) -> AbsoluteStability:
-    """Decide stability with every passive hand at every device, and the damping required for it.
+    """Return the verdict for every passive hand at every device, and the damping required for stability.
 
     Parameters
     ----------
@@ -331,11 +340,11 @@ def absolute_stability(model: TopologySource, *, params: Values | None = None) -
     Raises
     ------
     ApcError
-        A peer has no device, or a hand already; a device is coupled other than by samples and holds.
+        A peer has no device, or already a hand; a device is not coupled only by samples and holds.
     """
     from apc.haptics import absolute_stability
 
-    return absolute_stability.absolute_stability(_model(model, params))
+    return absolute_stability.absolute_stability(_numeric(model, params))
 
 
 @checked
@@ -348,26 +357,26 @@ def transparency(
     between: str = "",
     unstable: bool = False,
 ) -> Transparency:
-    """Compute the impedance at a device and the transmission of a force to another device.
+    """Return the impedance at a device, and the transmission of a force to another device.
 
     Parameters
     ----------
     model, params
         As for `analyze`.
     frequencies
-        (k,), in Hz, at most half the rate of the fastest clock.
+        The frequencies (k,) in Hz, at most half the rate of the fastest clock.
     at, between
-        The driven device, such as "left[1].device", and another; by default the first peer's and the next
-        one's.
+        The driven device, such as "left[1].device", and a second device; by default the devices of the first
+        two peers.
     unstable
         Whether to return the response of the frame map for an unstable model, which has no steady state.
 
     Returns
     -------
     Transparency
-        Impedance, transmitted admittance and error between copies, complex (k,), in SI, with a bound; mass,
-        low-frequency damping and stiffness; H∞ norms; H2 norms, an rms at the ticks: motion between ticks is
-        not included.
+        Impedance, transmitted admittance and error between copies, complex (k,), in SI units, with error
+        bounds; mass, low-frequency damping and stiffness; H∞ norms; H2 norms, which are rms values at the
+        ticks: motion between ticks is not included.
 
     Raises
     ------
@@ -376,46 +385,48 @@ def transparency(
     """
     from apc.haptics import frequency_response
 
-    listed = [frequencies] if isinstance(frequencies, int | float) else frequencies
+    frequency_list = [frequencies] if isinstance(frequencies, int | float) else frequencies
     return frequency_response.transparency(
-        _model(model, params), listed, at=at, between=between, unstable=unstable
+        _numeric(model, params), frequency_list, at=at, between=between, unstable=unstable
     )
 
 
 @checked
 def fit_link(recording: str | Path, *, interval: str | None = None) -> LinkFit:
-    """Compute the statistics of a recorded network as keys of a link.
+    """Return the statistics of a recorded network as the keys of a link.
 
     Parameters
     ----------
     recording
-        A file that ping or `irtt client -o` wrote, or a CSV table with a column `delay [ms]`.
+        A file written by ping or `irtt client -o`, or a CSV table with a column `delay [ms]`.
     interval
-        A time such as "8 ms" between two packets, if the file does not contain it.
+        The time between two packets, such as "8 ms", if the file does not contain this time.
 
     Returns
     -------
     LinkFit
-        The share lost with its interval, bursts, delays, the nearest jitter distribution; the printed form is
-        the link's entry.
+        The loss rate with its confidence interval, bursts, delays, and the nearest jitter distribution; the
+        printed form is the link's entry.
 
     Raises
     ------
     ApcError
-        The file is none of these.
+        The file is not a recording of one of these formats.
     """
     from apc.network import link_fit
-    from apc.option_value import option_value
+    from apc.support.option_value import option_value
 
-    between = None if interval is None else option_value("interval=", interval, subject="a time", unit="s")
-    return link_fit.fit_recording(recording, None if between is None else float(between))
+    sending_interval = (
+        None if interval is None else option_value("interval=", interval, subject="time", unit="s")
+    )
+    return link_fit.fit_recording(recording, None if sending_interval is None else float(sending_interval))
 
 
 @checked
 def mean_square_stability(
     model: TopologySource, *, params: Values | None = None, certify: bool = False
 ) -> MeanSquareStability | None:
-    """Analyze mean-square stability over the network, with lost and late packets.
+    """Return the mean-square stability over the network, with lost and late packets.
 
     Parameters
     ----------
@@ -425,8 +436,8 @@ def mean_square_stability(
     Returns
     -------
     MeanSquareStability or None
-        Verdict in mean square and the growth of second moments per frame with its error; None if every packet
-        takes its nominal delay.
+        Verdict in mean square, and the growth of second moments per frame with its error; None if every
+        packet has its nominal delay.
 
     Raises
     ------
@@ -435,84 +446,86 @@ def mean_square_stability(
     """
     from apc.mean_square import mean_square_stability
 
-    return mean_square_stability.mean_square_stability(_model(model, params), certify=certify)
+    return mean_square_stability.mean_square_stability(_numeric(model, params), certify=certify)
 
 
 @checked
 def margins(model: TopologySource, *, params: Values | None = None) -> Margins:
-    """Compute the stability margin of each coupler's stiffness and damping and of each delay, one at a time.
+    """Return the stability margins of each coupler's stiffness and damping and of each delay, varied one at
+    a time.
 
     Parameters
     ----------
     model, params
         As for `analyze`.
     """
-    from apc.parameter_studies import margins as growth
+    from apc.studies import margins as growth
 
-    return growth.margins(_model(model, params))
+    return growth.margins(_numeric(model, params))
 
 
 @checked
 def sensitivities(model: TopologySource, *, params: Values | None = None) -> Sensitivities:
-    """Differentiate the spectral radius with respect to every parameter.
+    """Return the derivatives of the spectral radius with respect to every parameter.
 
     Parameters
     ----------
     model, params
         As for `analyze`.
     """
-    from apc.parameter_studies import sensitivity
+    from apc.studies import sensitivity
 
-    return sensitivity.sensitivities(_model(model, params))
+    return sensitivity.sensitivities(_numeric(model, params))
 
 
 @checked
 def event_order(model: TopologySource, *, params: Values | None = None) -> EventOrder:
-    """Repeat the analysis under every order of coincident events and both readings of the start.
+    """Return the analyses under every order of coincident events and both interpretations of the start.
 
     Parameters
     ----------
     model, params
         As for `analyze`.
     """
-    from apc.analysis import event_order as orders
-
-    return orders.event_order(_model(model, params))
+    result: EventOrder = require_extension("event_order").event_order(_numeric(model, params))
+    return result
 
 
 @checked
 def contact_modes(model: TopologySource, *, params: Values | None = None) -> ContactModes:
-    """Analyse a model whose couplers push and never pull in each of their modes.
+    """Return the analyses of a model with one-sided contacts, in each contact mode.
 
     Parameters
     ----------
     model, params
         As for `analyze`.
     """
-    from apc.analysis import contact_modes as switched
+    from apc.analysis import contact_modes as modes
 
-    return switched.contact_modes(_model(model, params))
+    return modes.contact_modes(_numeric(model, params))
 
 
 @checked
 def arbitrary_switching(model: TopologySource, *, params: Values | None = None) -> ArbitrarySwitching:
-    """Prove stability under arbitrary switching of contacts, or under their state-dependent switching.
+    """Return the proof of stability under arbitrary switching of contacts, or under state-dependent
+    switching.
 
     Parameters
     ----------
     model, params
         As for `analyze`.
     """
-    from apc.analysis import arbitrary_switching as at_will
-    from apc.analysis import contact_modes as switched
+    from apc.analysis import contact_modes as modes
 
-    system = _model(model, params)
-    return at_will.arbitrary_switching(system, switched.contact_modes(system))
+    numeric = _numeric(model, params)
+    switching = require_extension("switching")
+    result: ArbitrarySwitching = switching.arbitrary_switching(numeric, modes.contact_modes(numeric))
+    return result
 
 
 @checked
 def limit_cycle(model: TopologySource, *, params: Values | None = None) -> LimitCycle:
-    """Predict the limit cycle of a model's one-sided contacts, and simulate it.
+    """Return the predicted limit cycle of a model's one-sided contacts, and its simulation.
 
     Parameters
     ----------
@@ -522,11 +535,10 @@ def limit_cycle(model: TopologySource, *, params: Values | None = None) -> Limit
     Raises
     ------
     ApcError
-        E864 no contact that pushes from tick to tick and never pulls.
+        E864 no one-sided contact that is computed at ticks.
     """
-    from apc.simulation import limit_cycle as cycles
-
-    return cycles.limit_cycle(_model(model, params))
+    result: LimitCycle = require_extension("switching").limit_cycle(_numeric(model, params))
+    return result
 
 
 @checked
@@ -537,19 +549,20 @@ def robust_stability(
     cells: int | None = None,
     params: Values | None = None,
 ) -> RobustStability:
-    """Prove stability for all values of some parameters within their ranges.
+    """Return the proof of stability for all values of parameters within ranges.
 
     Parameters
     ----------
     model, params
         As for `analyze`.
     box
-        Ranges by parameter, such as {"contact.stiffness": "±1%"}, "900 N/m:1100 N/m" or, in SI, (900, 1100).
+        Ranges by parameter, such as {"contact.stiffness": "±1%"}, "900 N/m:1100 N/m" or, in SI units, (900,
+        1100).
     cells
-        The largest number of cells; by default as many as take some seconds.
+        The largest number of cells; by default a number that takes some seconds.
     """
-    from apc.analysis.parametric_frames import parse_range
     from apc.analysis_report import robust_stability
+    from apc.studies.parameter_ranges import parse_range
 
     system = _model(model, params)
     ranges = [parse_range(system, f"{name}={_range(system, name, value)}") for name, value in box.items()]
@@ -558,21 +571,23 @@ def robust_stability(
 
 @checked
 def parameters(model: TopologySource) -> Parameters:
-    """List the settable parameters of a model: names, values, units and limits.
+    """Return the settable parameters of a model: names, values, units and limits.
 
     Parameters
     ----------
     model
         A compiled model, or the path of a topology or compiled model.
     """
-    from apc.frame import parameter_listing
+    from apc.parameter_values import parameter_listing
 
     return parameter_listing.parameters(_model(model, None))
 
 
 @checked
 def paper_method(model: TopologySource, *, params: Values | None = None) -> PaperMethod:
-    """Return the lifted matrices of Rakhsha and Constantinescu, eqs. (18) to (20), rows and columns named.
+    """Return the lifted matrices of Rakhsha and Constantinescu, equations 18 to 20.
+
+    Their rows and columns are named.
 
     Parameters
     ----------
@@ -582,11 +597,10 @@ def paper_method(model: TopologySource, *, params: Values | None = None) -> Pape
     Raises
     ------
     ApcError
-        E861 the model has not the form these matrices need.
+        E861 the model does not have the form assumed for these matrices.
     """
-    from apc.analysis import paper_method
-
-    return paper_method.paper_method(_model(model, params))
+    result: PaperMethod = require_extension("paper_method").paper_method(_model(model, params))
+    return result
 
 
 @checked
@@ -598,28 +612,29 @@ def region(
     criterion: Criterion | None = None,
     params: Values | None = None,
 ) -> Region:
-    """Find the boundary of the stable region of two parameters, as curves with their errors.
+    """Return the boundary of the stable region of two parameters, as curves with their errors.
 
     Parameters
     ----------
     model, params
         As for `analyze`.
     x, y
-        A parameter and its range, such as "contact.stiffness=10 N/m:3000 N/m" or, in SI,
-        ("contact.stiffness", 10, 3000); those of the model's `studies: region:` if not given.
+        A parameter and its range, such as "contact.stiffness=10 N/m:3000 N/m" or, in SI units,
+        ("contact.stiffness", 10, 3000); by default the axes of the model's `studies: region:`.
     criterion
         As for `critical`.
 
     Returns
     -------
     Region
-        Its curves, `.stable_area`, `.contains(x, y)` in SI, `.to_dataframe()`, `.plot()`.
+        The curves, `.stable_area`, `.contains(x, y)` in SI units, `.to_dataframe()`, `.plot()`.
 
     Raises
     ------
     ApcError
         The input is invalid.
     """
+    from apc.lifting.numeric_model import numeric_model
     from apc.regions import stable_region
     from apc.regions.axes import parse_axes
 
@@ -628,7 +643,8 @@ def region(
         axis if axis is None or isinstance(axis, str) else f"{axis[0]}={_range(system, axis[0], axis[1:])}"
         for axis in (x, y)
     )
-    return stable_region.region(system, parse_axes(system, first, second), criterion=criterion)
+    axes = parse_axes(system, first, second)
+    return stable_region.region(numeric_model(system), axes, criterion=criterion)
 
 
 @checked
@@ -644,24 +660,25 @@ def tune(
     seconds: float | None = None,
     params: Values | None = None,
 ) -> Tuning:
-    """Find the optimal gains under a specification, and prove that they satisfy it.
+    """Return the optimal gains under a specification, with a proof that they satisfy it.
 
     Parameters
     ----------
     model, params
         As for `analyze`.
     free
-        Ranges of the gains by name: {"coordination.stiffness": "10 N/m:5000 N/m"} or, in SI, (10, 5000).
+        Ranges of the gains by name: {"coordination.stiffness": "10 N/m:5000 N/m"} or, in SI units, (10,
+        5000).
     maximize, minimize
-        One of the two: a gain, a transparency metric ("coordination_error at 1 Hz", "damping",
-        "coordination_error_h2", "coordination_error_hinf"), or a weighted sum of these in SI;
+        The objective, one of the two: a gain, a transparency metric ("coordination_error at 1 Hz", "damping",
+        "coordination_error_h2", "coordination_error_hinf"), or a weighted sum of these in SI units;
         "spectral_radius" and "settling_time" are for `minimize` only.
     constraint
-        Demands in addition to stability, such as "decay=60 dB in 2 s".
+        Constraints in addition to stability, such as "decay=60 dB in 2 s".
     over
         The ranges of the scenarios: {"user.count": "2:10", "device.mass": "±20%", "lan.delay": "8 ms:20 ms"}.
     criterion
-        As for `critical`; over unreliable links the default is mean-square. Omitted arguments are those of
+        As for `critical`; over unreliable links the default is mean-square. The default of all arguments is
         the topology's `studies: tune:`.
     seconds
         The time limit.
@@ -669,7 +686,7 @@ def tune(
     Returns
     -------
     Tuning
-        Its `.gains`, whether they are `.proved`, and the active constraints.
+        The gains (`.gains`), whether they are `.proved`, and the active constraints.
 
     Raises
     ------
@@ -697,7 +714,7 @@ def pareto_front(
     seconds: float | None = None,
     params: Values | None = None,
 ) -> ParetoFront:
-    """Compute the Pareto front of an objective and a transparency metric.
+    """Return the Pareto front of an objective and a transparency metric.
 
     Parameters
     ----------
@@ -707,26 +724,28 @@ def pareto_front(
         The transparency metric: "impedance at 5 Hz", or transmitted, error, damping, error_h2,
         error_hinf.
     points
-        The number of bounds, from the smallest metric to that at the best objective.
+        The number of bounds on the metric, from its smallest value to its value at the best objective.
     seconds
-        The time limit for all of them.
+        The time limit for all points.
 
     Returns
     -------
     ParetoFront
-        Its `.designs`; `.plot()` draws it.
+        The designs (`.designs`); `.plot()` draws the front.
 
     Raises
     ------
     ApcError
         The input is invalid.
     """
-    from apc.tuning.pareto_front import pareto_front as pareto
     from apc.tuning.specification import read_tradeoff
 
     system, tuning_spec = _tuning_spec(model, params, free, over, criterion, maximize, minimize, constraint)
     until = float("inf") if seconds is None else seconds
-    return pareto(system, tuning_spec, read_tradeoff(tradeoff), points=points, seconds=until)
+    result: ParetoFront = require_extension("pareto_front").pareto_front(
+        system, tuning_spec, read_tradeoff(tradeoff), points=points, seconds=until
+    )
+    return result
 
 
 def _tuning_spec(
@@ -739,16 +758,16 @@ def _tuning_spec(
     minimize: str,
     constraint: Sequence[str],
 ) -> tuple[Model, TuningSpec]:
-    """Return a model with hands as in its study or the criterion, and the tuning specification."""
+    """Return a model with the hands of its study or the criterion, and the tuning specification."""
     from apc.tuning.specification import gripped_as_studied, read_tuning_spec
 
-    means: str | None = criterion
+    used_criterion: str | None = criterion
     system = _model(model, values)
     if criterion is None:
-        system, means = gripped_as_studied(system)
+        system, used_criterion = gripped_as_studied(system)
     ranges, required = (
-        [f"{name}={_range(system, name, value)}" for name, value in (requested or {}).items()]
-        for requested in (free, over)
+        [f"{name}={_range(system, name, value)}" for name, value in (named_ranges or {}).items()]
+        for named_ranges in (free, over)
     )
     tuning_spec = read_tuning_spec(
         system,
@@ -757,7 +776,7 @@ def _tuning_spec(
         minimize=minimize,
         constraint=constraint,
         over=required,
-        criterion=means,
+        criterion=used_criterion,
     )
     return system, tuning_spec
 
@@ -774,7 +793,7 @@ def sweep(
     cluster: str | None = None,
     params: Values | None = None,
 ) -> Sweep:
-    """Compute a result at every combination of some parameters' values.
+    """Return a result at every combination of parameter values.
 
     Parameters
     ----------
@@ -782,19 +801,20 @@ def sweep(
         As for `analyze`.
     over
         Values by parameter: "500 N/m:1500 N/m:11" (lower end, upper end, number of values), or a list of
-        quantities or of numbers in SI.
+        quantities or of numbers in SI units.
     of
-        "analyze", or "critical:PARAMETER".
+        The result: "analyze", or "critical:PARAMETER".
     criterion
         As for `critical`.
     out
-        A .parquet or .csv file; finished parts are stored next to it, and the same call resumes after them.
+        A .parquet or .csv file; finished parts are stored in its folder, and the same call resumes after
+        them.
     jobs
-        Processes; the number of cores if not given.
+        The number of processes; by default the number of cores.
     cluster
         The address of a Dask scheduler.
     """
-    from apc.sweeps import resumable_sweep
+    from apc.studies import resumable_sweep
 
     path = None if out is None else Path(out)
     system = _model(model, params)
@@ -809,18 +829,18 @@ def sweep(
 
 
 def _several(topologies: TopologySource | Iterable[TopologySource], function: str) -> list[TopologySource]:
-    """Return the models that a function is given, of which one needs no list; refuse none."""
+    """Return the models as a list, also for a single model. Raises ApcError if there is none."""
     if isinstance(topologies, Model | str | Path):
         return [topologies]
-    if listed := list(topologies):
-        return listed
-    hint = f'apc.{function}(["average.yaml", "mesh.yaml"])'
-    raise ApcError(Diagnostic("E610", SourceLocation(function), "no topology is given", hint=hint))
+    if models := list(topologies):
+        return models
+    fix = f'apc.{function}(["average.yaml", "mesh.yaml"])'
+    raise ApcError(Diagnostic("E610", SourceLocation(function), "no topology given", fix=fix))
 
 
 def _path(topology: TopologySource, function: str) -> Path:
-    """Return the path of a topology; refuse a compiled model, next to which it is expected."""
-    from apc.inputs import refuse_model
+    """Return the path of a topology file. Raises ApcError for a compiled model."""
+    from apc.inputs.open_model import refuse_model
 
     path = (
         Path(topology.origin.topology).with_suffix(".apc") if isinstance(topology, Model) else Path(topology)
@@ -830,18 +850,25 @@ def _path(topology: TopologySource, function: str) -> Path:
 
 
 def _model(model: TopologySource, params: Values | None) -> Model:
-    """Return a compiled model, with the parameters set."""
+    """Return the compiled model, with parameter values changed."""
     if not isinstance(model, Model):
-        from apc.inputs import load_or_compile
+        from apc.inputs.open_model import load_or_compile
 
         model = load_or_compile(Path(model))
     return set_parameters(model, params) if params else model
 
 
+def _numeric(model: TopologySource, params: Values | None) -> NumericModel:
+    """Return the model at its parameter values, with parameter values changed."""
+    from apc.lifting.numeric_model import numeric_model
+
+    return numeric_model(_model(model, params))
+
+
 def _check_out(model: TopologySource, system: Model, path: Path | None) -> None:
-    """Refuse to overwrite the input of the model."""
+    """Raise ApcError if an output file would overwrite the input of the model."""
     if path is not None and not isinstance(model, Model):
-        from apc.inputs import check_outputs
+        from apc.inputs.open_model import check_outputs
 
         check_outputs(Path(model), (name for name, _ in system.origin.texts), {"out=": path})
 
@@ -860,36 +887,37 @@ def simulate(
     trace_of: Literal["worst"] | None = None,
     error: bool = False,
 ) -> Trajectory:
-    """Simulate a model in time.
+    """Return the simulation of a model in time.
 
     Parameters
     ----------
     model
         A compiled model, or the path of a topology or compiled model.
     duration
-        The duration, such as "2 s" or 2; by default that of the model's experiment.
+        The duration, such as "2 s", or a number in seconds; by default the duration of the model's
+        experiment.
     params
         Parameter values to change first, as in `set_parameters`.
     signals
-        Patterns of the signals to keep, such as "cube.x" or "left[2].*"; all if there is none.
+        Patterns of the signals to store, such as "cube.x" or "left[2].*"; by default all signals.
     jit
-        Whether to compile to machine code where there is a C compiler.
+        Whether to compile to machine code if there is a C compiler.
     seed
-        Of the packets that get lost or come late; that of the model's experiment if not given.
+        The seed of random losses and delays of packets; by default the seed of the model's experiment.
     method
-        "exact", "rk4:STEP", "semi-implicit:STEP" or "cvodes:RTOL", such as "rk4:0.1 ms"; exact where linear
-        and by CVODES elsewhere if not given.
+        "exact", "rk4:STEP", "semi-implicit:STEP" or "cvodes:RTOL", such as "rk4:0.1 ms"; by default exact for
+        linear equations, and CVODES for nonlinear ones.
     impulse
-        A peer that is struck as the model begins, such as "user[1]": its device starts at 0.1 m/s.
+        A peer with an impulse at the start, such as "user[1]": its device has an initial velocity of 0.1 m/s.
     trace_of
-        "worst": lose packets by the periodic pattern that `analyze` finds to shake the model.
+        "worst": packets are lost in the periodic pattern for which `analyze` finds instability.
     error
-        Whether to estimate the error, by a second run.
+        Whether to estimate the error by a second simulation.
 
     Returns
     -------
     Trajectory
-        A row for every tick of the fastest clock with the values before the tick, and a summary.
+        One row for every tick of the fastest clock, with the values before the tick, and a summary.
 
     Raises
     ------
@@ -907,9 +935,7 @@ def simulate(
         if duration is None and system.experiment.duration is None:
             duration = float(push.WATCHED)
     if trace_of is not None:
-        from apc.mean_square.dropout_bounds import worst_trace
-
-        system = worst_trace(system)
+        system = require_extension("loss_models").worst_trace(system)
     length = duration if duration is None or isinstance(duration, str) else f"{float(duration)!r} s"
     return trajectory.simulate(
         system,
@@ -929,7 +955,7 @@ def bench(
     params: Values | None = None,
     rounds: int | None = None,
 ) -> Bench:
-    """Measure every method of analysis and of simulation on a model: time against true error.
+    """Return time and true error of every method of analysis and simulation for a model.
 
     Parameters
     ----------
@@ -938,12 +964,12 @@ def bench(
     params
         Parameters to change first, as `{"contact.stiffness": "800 N/m"}`.
     rounds
-        Runs of each method, fewer of slow ones; 15 if not given.
+        The number of runs of each method, fewer for slow methods; by default 15.
 
     Raises
     ------
     ApcError
-        The model can't be analysed at all.
+        No method can analyze the model.
     """
     from apc.benchmark import speed_and_error
 
@@ -965,7 +991,7 @@ def export(
     device: str = "",
     method: str = "",
 ) -> Result:
-    """Export a model to other tools.
+    """Return a model in the format of another tool, and write it to a file if `out` is given.
 
     Parameters
     ----------
@@ -975,16 +1001,17 @@ def export(
         "control", "mat" or "npz": a state space; "modelica": a model; "c": one peer in C99; "fmu": a model or
         a peer for co-simulation. The default follows from the suffix of `out`.
     out
-        The file to write; nothing is written if not given.
+        The file to write; by default no file is written.
     open_at
-        The link or coupler to cut the loop open at.
+        The link or coupler at which the loop is opened.
     symbolic
-        Parameters that stay free: `.function` is a `casadi.Function` of them that returns A, B, C and D.
+        Parameters that remain symbolic: `.function` is a `casadi.Function` of them that returns A, B, C and
+        D.
     peer
         For "c" and "fmu": the peer, such as "left[1]". By default an FMU includes all peers.
     device
-        For "c": the masses outside the peer's computer, "none" if none; by default those that are hand-held
-        or not sent to others.
+        For "c": the masses outside the peer's computer, or "none"; by default the masses that are hand-held
+        or not sent to other peers.
     method
         For "c" and "fmu": the integration method between ticks, as for `simulate`, such as "rk4:0.1 ms" for
         nonlinear equations.
@@ -1017,28 +1044,28 @@ def report(
     *,
     params: Values | None = None,
 ) -> Report:
-    """Create a report on topologies: all analyses on one page.
+    """Return a report on topologies, with all analyses on one page, and write it if `out` is given.
 
     Parameters
     ----------
     files
         Topologies, YAML files; several are compared.
     out
-        The page to write, `.html` or `.pdf`; nothing is written if not given.
+        The page to write, `.html` or `.pdf`; by default no page is written.
     params
-        As for `analyze`, of all of them.
+        As for `analyze`, for all topologies.
 
     Returns
     -------
     Report
-        Its `.topologies`, each with sections of tables, which are those of the other functions.
+        The topologies (`.topologies`), each with sections of tables, as from the other functions.
 
     Raises
     ------
     ApcError
         The input is invalid, or the page cannot be written.
     """
-    from apc.inputs import check_topology_outputs
+    from apc.inputs.open_model import check_topology_outputs
     from apc.output.report_output import check_report_path, save_report
     from apc.reports import contents
 

@@ -1,9 +1,9 @@
-"""A result: data that other rooms compute with, and that a person can look at.
+"""The base class of results: data for further computation, with functions for output.
 
 Takes: nothing. Gives: `Result`, `PlotStyle`.
-Guarantees: data know the name of what shows them and nothing of it: it is imported when it is asked for. In a
-notebook a result is its text and its picture, elsewhere a line.
-Does not: show anything itself (see `output`).
+Guarantees: a result has only the name of its output functions, which are imported on first use. In a
+notebook a result is shown as its text and picture, elsewhere as one line.
+Does not: format output (see `output`).
 """
 
 from __future__ import annotations
@@ -12,34 +12,36 @@ from collections.abc import Mapping, Sequence
 from importlib import import_module
 from typing import Any, ClassVar, TypedDict
 
-from apc.optional import need
+from apc.support.optional import need
 
 
 class PlotStyle(TypedDict, total=False):
-    """The style of a picture: `size` (width, height) in inches, `labels`, `style`.
+    """The style of a picture: `size` (width, height) in inches, `labels`, `style`, `notes`.
 
-    `labels` replaces texts in it; `style` is a style sheet of matplotlib, several, or its settings by name.
+    `labels` replaces texts of the picture; `style` is a style sheet of matplotlib, several, or settings by
+    name; `notes` states whether notes are printed below the figure (default: true).
     """
 
     size: tuple[float, float]
     labels: Mapping[str, str]
     style: str | Sequence[str] | Mapping[str, Any]
+    notes: bool
 
 
 class Result:
-    """A result, abstract.
+    """A result (abstract base class).
 
-    The module in `shown_by` has a function for each form of output, such as `critical_text`, which yields
-    lines, and `critical_picture`. Its document is its fields (`formatting.record`), unless there is a
-    `critical_document`.
+    The module in `shown_by`, of `apc.output` or by its full name, has a function for each form of output,
+    such as `critical_text`, which yields lines, and `critical_picture`. The document is made of the fields
+    (`formatting.record`), unless there is a function such as `critical_document`.
     """
 
     __slots__ = ()
     shown_by: ClassVar[str]
-    pictured: ClassVar[bool] = True  # in a notebook, where it has a picture
+    pictured: ClassVar[bool] = True  # whether a notebook shows the picture, if there is one
 
     def __init_subclass__(cls) -> None:
-        """Give every result the short repr, which `dataclass` leaves to a class that has one."""
+        """Set the short repr of every result, as `dataclass` does not replace an existing one."""
         if "__repr__" not in vars(cls):
             cls.__repr__ = Result.__repr__  # type: ignore[method-assign]
 
@@ -63,24 +65,29 @@ class Result:
         return document
 
     def _plotted(self, *arguments: Any, style: PlotStyle) -> Any:
-        """Return the picture, a matplotlib Figure or Axes, in the given style."""
+        """Return the picture in the given style, a matplotlib Figure or Axes."""
         written, labels = need("matplotlib.text", "plot").Text, style.get("labels", {})
         with need("matplotlib.style", "plot").context(style.get("style", [])):
             plotted = self._shown("picture", *arguments)
         if "size" in style:
             plotted.figure.set_size_inches(*style["size"])
         for text in plotted.figure.findobj(written):
-            text.set_text(labels.get(text.get_text(), text.get_text()))
+            hidden = text.get_gid() == "notes" and not style.get("notes", True)
+            text.set_text("" if hidden else labels.get(text.get_text(), text.get_text()))
         return plotted
 
     def _shown(self, form: str, *arguments: Any) -> Any:
-        """Return the result in another form, as its module has it.
+        """Return the result in a form of output: "text", "picture", "document" or "table".
 
-        Without one its document is made of its fields, and a table of its `rows`: see `pictures.table_of`.
+        It is made by the function of `shown_by` for this form. Without such a function, a document is made of
+        the fields, and a table of `rows` (see `pictures.table_of`).
         """
         module, _, name = self.shown_by.partition(":")
-        forms: Any = import_module(f"apc.output.{module}")
-        if hasattr(forms, f"{name}_{form}"):
-            return getattr(forms, f"{name}_{form}")(self, *arguments)
-        other, called = {"document": ("formatting", "record"), "table": ("pictures", "table_of")}[form]
-        return getattr(import_module(f"apc.output.{other}"), called)(self)
+        output_module: Any = import_module(module if "." in module else f"apc.output.{module}")
+        if hasattr(output_module, f"{name}_{form}"):
+            return getattr(output_module, f"{name}_{form}")(self, *arguments)
+        default_module, default_function = {
+            "document": ("formatting", "record"),
+            "table": ("pictures", "table_of"),
+        }[form]
+        return getattr(import_module(f"apc.output.{default_module}"), default_function)(self)

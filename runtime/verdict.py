@@ -1,10 +1,11 @@
-"""Verdicts, proofs and limitations as data, each with its one text.
+"""Verdicts, proofs and limitations as data, each with a unique text.
 
 Takes: nothing.
 Gives: `Term`, `Sentence`; `StabilityVerdict`, `BoxVerdict`; `ProofMethod`, `ProofOutcome`, `ProofScope`,
 `StabilityProof`, `NO_PROOF`; `LimitationCode`, `Limitation`, `Note`, `code_of`.
-Guarantees: a decision reads a member, a number or a code; the text is made here, and for output only.
-Does not: decide (see `eigen.spectrum`), or know how wide a line is (see `output`).
+Guarantees: decisions depend on members, numbers and codes; the texts are defined here, and are for output
+only.
+Does not: decide stability (see `spectrum.spectrum`), or format lines (see `output`).
 """
 
 from __future__ import annotations
@@ -14,21 +15,21 @@ from enum import StrEnum
 
 
 class Term(StrEnum):
-    """A member of a closed set, equal to its text in every output."""
+    """A member of an enumeration, equal to its text in every output."""
 
     def __repr__(self) -> str:
-        """Return the text as Python writes it."""
+        """Return the text as a Python literal."""
         return repr(self.value)
 
 
 class Sentence:
-    """Data whose document is a text: `str` of it."""
+    """Data that are written to a document as their text, `str` of them."""
 
     __slots__ = ()
 
 
 class StabilityVerdict(Term):
-    """The verdict on a spectrum; the numbers of rigid modes are fields of the result that has it."""
+    """The verdict on a spectrum; the numbers of rigid modes are fields of the result with the verdict."""
 
     STABLE = "stable"
     STABLE_TRANSLATING = "stable up to a common translation"
@@ -40,51 +41,51 @@ class StabilityVerdict(Term):
 
     @property
     def stable(self) -> bool | None:
-        """Whether it means stable; None if undecided."""
+        """Whether the verdict means stable; None if undecided."""
         if self is StabilityVerdict.UNDECIDED:
             return None
         return self not in (StabilityVerdict.DRIFTS, StabilityVerdict.UNSTABLE)
 
     @property
     def word(self) -> str:
-        """The verdict in a word, rigid modes left out."""
+        """The verdict in one word, without rigid modes."""
         if self.stable is None:
             return "undecided"
         return str(StabilityVerdict.STABLE if self.stable else self)
 
     @property
     def up_to_rigid_modes(self) -> bool:
-        """Whether it means stable in all but rigid modes."""
+        """Whether the verdict means stable except for rigid modes."""
         return self.stable is True and self is not StabilityVerdict.STABLE
 
 
 class BoxVerdict(Term):
-    """The verdict over a box where neither that of stable nor of unstable points is proved."""
+    """The verdict over a box of parameters if neither stability nor instability of all points is proved."""
 
     UNDECIDED = "undecided"
 
 
 class ProofMethod(Term):
-    """How a verdict is known, or the value at which it changes."""
+    """The method by which a verdict, or the value at which the verdict changes, was determined."""
 
     NONE = ""
     BALLS = "ball arithmetic"
-    ROUNDED = "by floats whose every rounding is bounded"
-    BOUNDED = "bounded in floats"
-    ESTIMATED = "estimated in floats"
-    COINCIDENT_EVENTS = "events coincide there"
-    OPEN_BETWEEN = "analysed on either side; the verdict between them is left open"
-    ANALYSED_BESIDE = "analysed on either side"
-    BOTH_COUNTS = "both judged"
-    SOME_COUNTS = "some counts are left open"
-    BOUNDED_MOMENTS = "second moments bounded on either side"
-    BOUNDED_HANDS = "what hands can draw bounded on either side"
-    ITERATED_MOMENTS = "second moments by iteration in floats, not proved"
-    ESTIMATED_MOMENTS = "an estimate, not proved: of second moments that are themselves estimates"
+    ROUNDED = "in floating point with rigorous error bounds"
+    BOUNDED = "rigorous floating-point bounds"
+    ESTIMATED = "floating-point estimate"
+    COINCIDENT_EVENTS = "events coincide"
+    OPEN_BETWEEN = "analyzed on both sides; undecided between"
+    ANALYSED_BESIDE = "analyzed on both sides"
+    BOTH_COUNTS = "both analyzed"
+    SOME_COUNTS = "some counts are undecided"
+    BOUNDED_MOMENTS = "second moments bounded on both sides"
+    BOUNDED_HANDS = "passivity bounded on both sides"
+    ITERATED_MOMENTS = "second moments by floating-point iteration, not proved"
+    ESTIMATED_MOMENTS = "estimate from estimated second moments, not proved"
 
 
 class ProofOutcome(Term):
-    """The outcome of a proof; `PARTLY` where it decides only the cases that floats left open."""
+    """The outcome of a proof; `PARTLY` if it decides only cases undecided in floats."""
 
     STABLE = "proved stable"
     DRIFTS = "proved to drift"
@@ -94,12 +95,12 @@ class ProofOutcome(Term):
 
     @property
     def proved(self) -> bool:
-        """Whether the verdict is proved as a whole."""
+        """Whether the entire verdict is proved."""
         return self not in (ProofOutcome.UNDECIDED, ProofOutcome.PARTLY)
 
 
 class ProofScope(Term):
-    """The subject of a proof, where it is not the unchanged topology."""
+    """The subject of a proof, if it is not the unchanged topology."""
 
     LINEARIZATION = "the linearization"
     NOMINAL_NETWORK = "the nominal network"
@@ -109,10 +110,11 @@ class ProofScope(Term):
 
 @dataclass(frozen=True, slots=True)
 class StabilityProof(Sentence):
-    """How a verdict, or a value at which it changes, is known; false where there is no proof to report.
+    """The proof of a verdict, or of a value at which the verdict changes.
 
-    `bits` is the precision of ball arithmetic, 0 without it. `outcome` is None of a value at which the
-    verdict changes. `undecided` is how many numbers of peers between the two are undecided.
+    A proof is false in a condition if there is nothing to report. `bits` is the precision of ball arithmetic,
+    0 without it. `outcome` is None for a value at which the verdict changes. `undecided` is the number of
+    undecided numbers of peers between two values.
     """
 
     method: ProofMethod = ProofMethod.NONE
@@ -127,18 +129,18 @@ class StabilityProof(Sentence):
     def __str__(self) -> str:
         """Return the proof as a text, "" without one."""
         if self.undecided:
-            return f"{self.undecided} between are left open"
+            return f"{self.undecided} between are undecided"
         text = str(self.method)
         if self.method is ProofMethod.BALLS:
             at = "at" if self.outcome is ProofOutcome.UNDECIDED else "with"
             text = f"{self.outcome or 'proved'} {at} {self.bits} bits"
             if self.outcome is ProofOutcome.PARTLY:
-                text += " where floats left it open"
+                text += " where floating point is undecided"
         elif self.method is ProofMethod.ROUNDED:
             criterion = " in mean square," if ProofScope.MEAN_SQUARE in self.scope else ""
             text = f"{self.outcome or 'proved'}{criterion} {self.method}"
         if ProofScope.CLAMPED_DEVICES in self.scope:
-            text = f"with its devices clamped it is unstable: {text}"
+            text = f"unstable with clamped devices: {text}"
         of = [
             scope for scope in (ProofScope.LINEARIZATION, ProofScope.NOMINAL_NETWORK) if scope in self.scope
         ]
@@ -149,7 +151,7 @@ NO_PROOF = StabilityProof()
 
 
 class LimitationCode(Term):
-    """A limitation of a result, or a fault in it."""
+    """The code of a limitation of a result, or of an error in it."""
 
     NOT_PROVED = "not proved"
     NO_BALLS = "no ball arithmetic"
@@ -162,30 +164,30 @@ class LimitationCode(Term):
     OPEN_VERDICT = "open verdict"
     WRONG_BOUND = "wrong bound"
     CRASHED = "crashed"
+    NOT_INSTALLED = "not installed"
 
 
 _TEXTS = {
     LimitationCode.NOT_PROVED: "{}: not proved, as {}",
-    LimitationCode.NO_BALLS: "not proved, as method {} has no matrix of balls",
+    LimitationCode.NO_BALLS: "not proved, as method {} has no ball arithmetic",
     LimitationCode.ONE_DIRECTION: "along one direction; along others: {}",
-    LimitationCode.UNSTABLE_MAP: "of the map: the topology is unstable",
-    LimitationCode.SLOWER_MOTION: (
-        "of slow motions nothing is told: something of the topology is slower still"
-    ),
+    LimitationCode.UNSTABLE_MAP: "response of the frame map; the topology is unstable",
+    LimitationCode.SLOWER_MOTION: ("no low-frequency impedance, as the topology has slower modes"),
     LimitationCode.COUPLED_COPIES: (
-        "largest gains leave out how far the copies of peers that differ move apart together"
+        "the H∞ norm of the coordination error is not computed for different peers"
     ),
-    LimitationCode.CLOCK_PHASE: "what noise does is not told: the fastest clock has a phase",
-    LimitationCode.WRONG_VERDICT: "WRONG: {} says {}, {} {}",
-    LimitationCode.OPEN_VERDICT: "WRONG: analyze leaves the verdict open: {}",
+    LimitationCode.CLOCK_PHASE: "no response to noise, as the fastest clock has a phase",
+    LimitationCode.WRONG_VERDICT: "WRONG: {} gives {}, {} {}",
+    LimitationCode.OPEN_VERDICT: "WRONG: analyze is undecided: {}",
     LimitationCode.WRONG_BOUND: "WRONG: the bound of {} does not hold",
     LimitationCode.CRASHED: "FAILED, which is a bug: {}",
+    LimitationCode.NOT_INSTALLED: "not computed: {}, as the extension {} is not installed",
 }
 
 
 @dataclass(frozen=True, slots=True)
 class Limitation(Sentence):
-    """A limitation of a result: its code, and the names and numbers that its text holds."""
+    """A limitation of a result: its code, and the names and numbers in its text."""
 
     code: LimitationCode
     arguments: tuple[str, ...] = ()
@@ -200,5 +202,5 @@ Note = str | Limitation
 
 
 def code_of(note: Note) -> LimitationCode | None:
-    """Return the code of a note, None of a text for output only."""
+    """Return the code of a note; None for a text for output only."""
     return note.code if isinstance(note, Limitation) else None

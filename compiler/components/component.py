@@ -3,7 +3,7 @@
 Takes: nothing (data types). Gives: `Component` and its parts: `ComponentVariable`, `Connector`,
 `NumberParameter`, `Option`, `Reference`, `SentValue`, `PartBindings`, `Inner`, `Linearized`; `option_test`.
 Guarantees: plain frozen data.
-Does not: read or check text (see `library`).
+Does not: read or check text (see `definitions`, `component_check`).
 """
 
 from __future__ import annotations
@@ -31,17 +31,20 @@ from apc.compiler.source.nodes import Node
 
 T = TypeVar("T")
 Named = tuple[tuple[str, T], ...]  # values by name, in order
-Joined = tuple[tuple[str, str, str], ...]  # connectors, each with a part and a connector of it
+Joined = tuple[
+    tuple[str, str, str], ...
+]  # connections: own connector, connected part, connector of that part
 
 OTHERS = "others"
-# Words of the language, which nothing may have as its name.
+# Reserved words of the language, invalid as names.
 RESERVED = frozenset(
     {"peers", "others", "time", "pi", "ground", "type", "at", "shared", "set", *FUNCTIONS, *KEYWORDS}
 )
 # Symbols of published conditions on virtual walls: stiffness and damping of the wall, damping and Coulomb
 # friction of the device, sampling period, delay of the loop, resolution of the position.
 SYMBOLS = ("K", "B", "b", "c", "T", "t_d", "D")
-# A parameter of one of these roles isn't a number: it names, or describes, something of the topology.
+# Roles of parameters that are no numbers: a clock or a link by name, or the description of a graph, delays,
+# losses, a trace or a table.
 ROLES = (
     "clock",
     "link",
@@ -55,9 +58,9 @@ ROLES = (
 
 @dataclass(frozen=True, slots=True)
 class ComponentVariable:
-    """A variable of a component or connector; `start` is None for one that needs no start value.
+    """A variable of a component or connector; `start` is None for a variable without a start value.
 
-    `limit` is the parameter that its size should stay within, empty if there is none.
+    `limit` is the name of the parameter that bounds its absolute value, or empty.
     """
 
     name: str
@@ -70,7 +73,7 @@ class ComponentVariable:
 
 @dataclass(frozen=True, slots=True)
 class Connector:
-    """A connector type: potentials are equal where connectors meet, flows sum to zero."""
+    """A connector type: the potentials of connected connectors are equal, their flows sum to zero."""
 
     name: str
     description: str
@@ -80,9 +83,9 @@ class Connector:
 
 @dataclass(frozen=True, slots=True)
 class NumberParameter:
-    """A parameter that is a number, in SI; with `divided`, a shared part divides it among the peers.
+    """A parameter that is a number, in SI units; if `divided`, a shared part divides it among the peers.
 
-    `words` gives names to values, such as left: -1.
+    `words` names values, such as left: -1.
     """
 
     name: str
@@ -104,7 +107,7 @@ class NumberParameter:
 
 @dataclass(frozen=True, slots=True)
 class Option:
-    """A parameter that is a word, decided when the topology is compiled."""
+    """A parameter whose value is one of `words`, fixed when the topology is compiled."""
 
     name: str
     words: tuple[str, ...]
@@ -142,8 +145,9 @@ class SentValue:
 class PartBindings:
     """The entry of a part, in the names of the enclosing scope.
 
-    `described` are the nodes of parameters that describe something (a graph, a table). `connections` join a
-    connector to (part, connector); the part "ground" is fixed, an empty part is the component around.
+    `described` has the nodes of parameters that describe a graph, delays, losses, a trace or a table.
+    `connections` connect a connector to (part, connector); the part "ground" is fixed, an empty part is the
+    enclosing component.
     """
 
     values: Named[ValueBinding]
@@ -156,7 +160,7 @@ class PartBindings:
 
 @dataclass(frozen=True, slots=True)
 class Inner:
-    """A part inside a component; its entry is in the terms of the outer component."""
+    """A part inside a component; its entry is written in the names of the outer component."""
 
     name: str
     component: Component
@@ -166,10 +170,10 @@ class Inner:
 
 @dataclass(frozen=True, slots=True)
 class Linearized:
-    """The linear representation of a component in a linear analysis.
+    """The equations of a component in a linear analysis, where they differ from its own.
 
-    Each of `equations` replaces the equation with the same left side. `valid` describes the motions it
-    applies to.
+    Each of `equations` replaces the equation with the same left side. `valid` describes the motions for which
+    they are valid.
     """
 
     equations: tuple[Equation, ...]
@@ -178,12 +182,12 @@ class Linearized:
 
 @dataclass(frozen=True, slots=True)
 class Component:
-    """A complete component.
+    """A component with its declarations and equations.
 
-    `locals` are undeclared names that are the left side of an equation; they have the dimension of the right
-    side. `passed` are the connectors that belong to an inner part: (connector, inner part, its connector).
-    `grips` are the connectors a hand is joined to where it names none; `peers` is for how many peers it is, 0
-    for any number.
+    `locals` are undeclared names on the left side of an equation; they have the dimension of the right side.
+    `passed` are the connectors that belong to an inner part: (connector, inner part, its connector). `grips`
+    are the connectors that a hand is connected to by default; `peers` is the required number of peers, 0 for
+    any number.
     """
 
     name: str
@@ -200,7 +204,7 @@ class Component:
     passed: Joined = ()
     grips: tuple[str, ...] = ()
     peers: int = 0
-    linearized: Linearized | None = None  # None where the equations themselves are linearized
+    linearized: Linearized | None = None  # None if the component's own equations are linearized
     symbols: Named[str] = ()  # symbols of published wall conditions, and their parameters
 
     def parameter(self, name: str) -> Parameter | None:
@@ -232,29 +236,33 @@ class Component:
 
     @property
     def depth(self) -> int:
-        """Return the nesting depth of parts: 1 for a component without any."""
+        """The nesting depth of parts: 1 for a component without inner parts."""
         return 1 + max((inner.component.depth for inner in self.inner), default=0)
 
     @property
     def size(self) -> int:
-        """The number of parts, including the part itself and inner ones."""
+        """The number of parts: the part itself and all inner parts."""
         return 1 + sum(inner.component.size for inner in self.inner)
 
     @property
     def receives_from_others(self) -> bool:
-        """Whether an equation, here or in an inner part, reads the other peers."""
-        read = (names(side) for equation in self.equations for side in (equation.left, equation.right))
-        local = any(name.parts[0] == OTHERS for side in read for name in side)
-        return local or any(inner.component.receives_from_others for inner in self.inner)
+        """Whether an equation of the component or of an inner part has a value received from the
+        other peers.
+        """
+        side_names = (names(side) for equation in self.equations for side in (equation.left, equation.right))
+        is_receiver = any(name.parts[0] == OTHERS for side in side_names for name in side)
+        return is_receiver or any(inner.component.receives_from_others for inner in self.inner)
 
 
-Settable = (
-    NumberParameter | Option | Reference | ComponentVariable
-)  # what a group of peers can set for itself
+# A declaration whose value a group of peers can set.
+Settable = NumberParameter | Option | Reference | ComponentVariable
 
 
 def option_test(node: Expr, options: dict[str, Option]) -> tuple[Option, str] | None:
-    """Return the option and the word that a comparison such as `delays == all` is about."""
+    """Return the option and the word compared in a test such as `delays == all`.
+
+    The result is None for other expressions.
+    """
     match node:
         case Call("==" | "!=", (Name((name,)), Name((word,)))) if (
             name in options and word in options[name].words

@@ -2,9 +2,9 @@
 
 Takes: the body of a definition.
 Gives: `read_equations`, `read_linearized`, `read_sends`, `read_variables`, `read_parameters`.
-Guarantees: a number is in SI and of its declared unit's dimension; a fault is reported and its item left out;
-a vector is declared as its entries, `x[1]`, `x[2]`.
-Does not: look at how the declarations fit together (see `definitions`).
+Guarantees: a number is in SI units and has the dimension of its declared unit; an invalid item is reported
+and omitted; a vector is declared as its entries, `x[1]`, `x[2]`.
+Does not: check the declarations against each other (see `definitions`).
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from apc.compiler.components.component import (
     Reference,
     SentValue,
 )
-from apc.compiler.errors import ApcError, Mistakes, SourceLocation
+from apc.compiler.errors import ApcError, Mistakes, SourceLocation, nearest
 from apc.compiler.language.constants import check_constants
 from apc.compiler.language.dimensions import DIMENSIONLESS
 from apc.compiler.language.expression import Equation
@@ -62,23 +62,24 @@ _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?\Z", re.ASCII)
 
 
 def read_equations(root: MappingReader, mistakes: Mistakes) -> tuple[tuple[Equation, ...], set[str]]:
-    """Read `equations: [a + b = c]`.
+    """Return the equations of the section `equations: [a + b = c]`, and the names defined by invalid
+    equations.
 
     Parameters
     ----------
     root
         The definition.
     mistakes
-        Collects the errors of equations, independent of other errors.
+        The collector of the errors of equations, separate from other errors.
 
     Returns
     -------
-    The equations, and the names that are the left side of unreadable ones.
+    The equations, and the names on the left side of equations that cannot be parsed.
     """
     equations, undefined = list[Equation](), set[str]()
     for item in root.read("equations", _items, ()):
         with mistakes:
-            text = text_of(item, "an equation", "- a + b = c")
+            text = text_of(item, "equation", "- a + b = c")
             defined = _DEFINES.findall(text)
             undefined.update(defined)
             equations.append(_equation(text, text_location(item)))
@@ -87,14 +88,17 @@ def read_equations(root: MappingReader, mistakes: Mistakes) -> tuple[tuple[Equat
 
 
 def read_linearized(root: MappingReader, mistakes: Mistakes) -> Linearized | None:
-    """Read `linearized: {equations: [f = b*v], valid: speeds above the threshold}`, or one equation alone.
+    """Return the equations of a linear analysis, None if the section is missing.
+
+    The section is `linearized: {equations: [f = b*v], valid: speeds above the threshold}`, a list of
+    equations, or one equation.
 
     Parameters
     ----------
     root
         The definition.
     mistakes
-        Collects the errors of equations.
+        The collector of the errors of equations.
     """
     node = root.nodes.get("linearized")
     if node is None:
@@ -111,13 +115,16 @@ def read_linearized(root: MappingReader, mistakes: Mistakes) -> Linearized | Non
         mistakes.take(fault("E203", node.location, "linearized", "at least one equation", "none", example))
     for item in items:
         with mistakes:
-            text = text_of(item, "an equation", "linearized: a = b")
+            text = text_of(item, "equation", "linearized: a = b")
             equations.append(_equation(text, text_location(item)))
     return Linearized(tuple(equations), valid)
 
 
 def _equation(text: str, location: SourceLocation) -> Equation:
-    """Return an equation whose constants are bounded."""
+    """Return the equation that a text states.
+
+    Raises ApcError for invalid syntax or a constant that is too long.
+    """
     equation = parse_equation(text, location)
     for side in (equation.left, equation.right):
         check_constants(side, text, location)
@@ -125,13 +132,14 @@ def _equation(text: str, location: SourceLocation) -> Equation:
 
 
 def _items(node: Node, subject: str) -> tuple[Node, ...]:
+    """Return the items of a list node. Raises ApcError for another node."""
     if isinstance(node, Sequence):
         return node.items
-    raise fault("E203", node.location, subject, "a list", form(node), "equations: [a + b = c]")
+    raise fault("E203", node.location, subject, "a list, such as [a + b = c]", form(node))
 
 
 def read_sends(root: MappingReader, mistakes: Mistakes) -> tuple[SentValue, ...]:
-    """Read `sends: {x: sample(object.x)}`, their dimensions left open."""
+    """Return the sent values of the section `sends: {x: sample(object.x)}`, with provisional dimensions."""
     sends = []
     for key, value in root.section("sends", "{x: sample(object.x)}"):
         with mistakes:
@@ -144,16 +152,19 @@ def read_sends(root: MappingReader, mistakes: Mistakes) -> tuple[SentValue, ...]
 
 
 def read_variables(root: MappingReader, section: str = "variables") -> tuple[ComponentVariable, ...]:
-    """Read `variables: {x: {unit: m}}`, or a connector's potentials or flows."""
+    """Return the variables of the section `variables: {x: {unit: m}}`, or a connector's potentials
+    or flows.
+    """
 
     def read(key: Scalar, value: Node) -> list[ComponentVariable]:
+        """Return the variable of one entry; a vector as its entries."""
         name = name_of(key, "a variable")
         meant = value.text if isinstance(value, Scalar) and _is_unit(value.text) else "…"
         node = mapping_of(value, name, f"{name}: {{unit: {meant}}}")
         body = MappingReader(node, VARIABLE, f"variable {name}", root.mistakes)
         description, limit = body.text("description"), body.text("limit", "limit: force_limit")
         unit, size = _unit_and_size(body, name)
-        starts = _entry_by_entry(body, "start", name, unit, size)
+        starts = _named_values(body, "start", name, unit, size)
         return [
             ComponentVariable(text, unit, start, description, key.location, limit) for text, start in starts
         ]
@@ -162,23 +173,25 @@ def read_variables(root: MappingReader, section: str = "variables") -> tuple[Com
 
 
 def _is_unit(text: str) -> bool:
+    """Return whether a text is a valid unit."""
     with suppress(ApcError):
         return bool(text.strip() and parse_unit(text, SourceLocation("")))
     return False
 
 
 def read_parameters(root: MappingReader) -> tuple[Parameter, ...]:
-    """Read `parameters: {stiffness: {unit: N/m, min: 0}}`: numbers, options, tables and roles."""
+    """Return the parameters of the section `parameters: {stiffness: {unit: N/m, min: 0}}`."""
 
     def read(key: Scalar, value: Node) -> Several[Parameter]:
+        """Return the number, option, table or reference of one entry; a vector as its entries."""
         name = name_of(key, "a parameter")
         message = f"parameter {name}"
         if isinstance(value, Scalar):
             if value.text in ROLES:
                 return [Reference(name, value.text, "", value.location)]
-            expected, hint = f"{', '.join(ROLES)}, or a mapping with its unit", "{unit: N/m, min: 0}"
-            got = brief(value.text) or "nothing"
-            raise fault("E203", value.location, message, expected, got, f"{name}: {hint}")
+            expected, fix = f"{', '.join(ROLES)}, or a mapping with its unit", "{unit: N/m, min: 0}"
+            got, fix = brief(value.text) or "nothing", nearest(value.text, ROLES) or fix
+            raise fault("E203", value.location, message, expected, got, f"{name}: {fix}")
         node = mapping_of(value, message, f"{name}: {{unit: N/m}}")
         if (table := node.get("table")) is not None:
             body = MappingReader(node, TABLE, message, root.mistakes)
@@ -192,13 +205,15 @@ def read_parameters(root: MappingReader) -> tuple[Parameter, ...]:
 
 
 def _option(name: str, options: Sequence, body: MappingReader) -> Option:
+    """Return the declaration of an option; `options` are its words."""
     words = []
     for item in options.items:
         with body.mistakes:
-            words.append(text_of(item, "an option"))
+            words.append(text_of(item, "option"))
 
     def known(node: Node, key: str) -> str:
-        return among(text_of(node, key), words, node.location, f"{name} has no option {{}}")
+        """Return the default, one of the words of the option."""
+        return among(text_of(node, key), words, node.location, f"{name}: unknown option {{}}")
 
     return Option(
         name, tuple(words), body.read("default", known, None), body.text("description"), options.location
@@ -206,7 +221,7 @@ def _option(name: str, options: Sequence, body: MappingReader) -> Option:
 
 
 def _numbers(name: str, body: MappingReader) -> list[NumberParameter]:
-    """Read a number's declaration, or a vector's, of which each entry is a number."""
+    """Return the declaration of a number, or of each entry of a vector."""
     description, shared, nodes, mistakes = (
         body.text("description"),
         body.text("shared"),
@@ -217,65 +232,67 @@ def _numbers(name: str, body: MappingReader) -> list[NumberParameter]:
         mistakes.take(fault("E203", nodes["shared"].location, "shared", "divided or whole", brief(shared)))
     unit, size = _unit_and_size(body, name)
     minimum, above, most = (
-        body.read(key, lambda node, _: _number(node, name, unit), None)
+        body.read(key, lambda node, key: _number(node, key, unit), None)
         for key in ("min", "exclusive_min", "max")
     )
     if size and "options" in nodes:
         location = nodes["options"].location
-        raise fault("E203", location, name, "a number, to have names for its values", "a vector")
+        raise fault("E203", location, f"{name}: a parameter with options can't have a size")
     if minimum is not None and above is not None:
         mistakes.add(
-            "E203", nodes["exclusive_min"].location, name, expected="either min or exclusive_min", got="both"
+            "E203", nodes["exclusive_min"].location, name, expected="min or exclusive_min", got="both"
         )
     least = minimum if above is None else above
     first, *_ = names_of(name, size)
-    model = NumberParameter(
+    template = NumberParameter(
         first, unit, None, least, above is not None, most, shared == "divided", (), description, body.location
     )
 
     def check(number: Fraction | None, node: Node | None, subject: str) -> None:
-        """Hold a number of the declaration itself against its bounds."""
+        """Record a number of the declaration that violates the bounds of the declaration."""
         if number is not None and node is not None:
-            model.bounds.check(ScalarValue(number, unit.dimension, None, node.location), subject, mistakes)
+            template.bounds.check(ScalarValue(number, unit.dimension, None, node.location), subject, mistakes)
 
-    check(most, nodes.get("max"), f"the max of {first}")
+    check(most, nodes.get("max"), f"max of {first}")
     words: dict[str, Fraction] = {}
     for key, node in mapping_of(nodes["options"], "options").entries if "options" in nodes else ():
         with mistakes:
             words[key.text] = _number(node, key.text, unit)
-            check(words[key.text], node, f"{key.text} of {first}")
-    defaults = _entry_by_entry(body, "default", name, unit, size, words)
+            check(words[key.text], node, f"option {key.text} of {first}")
+    defaults = _named_values(body, "default", name, unit, size, words)
     for text, default in defaults:
-        check(default, nodes.get("default"), f"the default of {text}")
-    named = tuple(words.items())
-    return [replace(model, name=text, default=default, words=named) for text, default in defaults]
+        check(default, nodes.get("default"), f"default of {text}")
+    word_values = tuple(words.items())
+    return [replace(template, name=text, default=default, words=word_values) for text, default in defaults]
 
 
 def _unit_and_size(body: MappingReader, name: str) -> tuple[Unit, int]:
-    """Read the unit that a declaration must have, and `size: 2`, the entries of a vector; 0 for a number."""
+    """Return the unit of a declaration, and its `size`: the number of entries of a vector, 0 for a number."""
     unit = body.read("unit", _unit, None)
-    size = body.read("size", partial(_size, name=name), 0)
+    size = body.read("size", partial(_size, name=name, unit=unit.text if unit else "1"), 0)
     if unit is None and "unit" not in body.nodes:
-        hint = f"{name}: {{unit: N/m}}  (unit: 1 when it has none)"
-        raise fault("E201", body.location, f"{name} has no unit", hint=hint)
+        fix, advice = f"{name}: {{unit: N/m}}", "use unit: 1 for a dimensionless parameter"
+        raise fault("E201", body.location, f"{name} has no unit", fix=fix, advice=advice)
     if unit is None:
         raise AlreadyReportedError
     return unit, size
 
 
-def _unit(node: Node, subject: str, hint: str = "unit: N/m") -> Unit:
-    return parse_unit(text_of(node, subject, hint), node.location)
+def _unit(node: Node, subject: str, fix: str = "unit: N/m") -> Unit:
+    """Return the unit named by a node."""
+    return parse_unit(text_of(node, subject, fix), node.location)
 
 
-def _size(node: Node, subject: str, name: str) -> int:
+def _size(node: Node, subject: str, name: str, unit: str) -> int:
+    """Return the number of entries of a vector, 2 or 3; `unit` is the unit in messages."""
     size = whole_number(node)
     if size in SIZES:
         return size
-    hint = f"{name}: {{unit: m, {subject}: 2}}" if size != 1 else f"{name}: {{unit: m}}"
-    raise fault("E203", node.location, f"the {subject} of {name}", "2 or 3", form(node), hint)
+    fix = f"{name}: {{unit: {unit}, {subject}: 2}}" if size != 1 else f"{name}: {{unit: {unit}}}"
+    raise fault("E203", node.location, f"{subject} of {name}", "2 or 3", form(node), fix)
 
 
-def _entry_by_entry(
+def _named_values(
     body: MappingReader,
     key: str,
     name: str,
@@ -283,19 +300,44 @@ def _entry_by_entry(
     size: int,
     words: Mapping[str, Fraction] | None = None,
 ) -> Named[Fraction | None]:
-    """Read the default or start of a number, or the list of a vector's, by names; None of one not given."""
+    """Return the `default` or `start` of a declaration by name, each entry of a vector by its own name.
+
+    Parameters
+    ----------
+    body
+        The declaration.
+    key
+        The key, `default` or `start`.
+    name, unit, size
+        The name, the unit, and the number of entries of a vector, 0 for a number.
+    words
+        Words that represent numbers, with their values.
+
+    Returns
+    -------
+    The names with their values in SI units; None for a missing value.
+    """
 
     def read(node: Node, _: str) -> list[Fraction | None]:
+        """Return the values of the key, in SI units."""
+        if not size and isinstance(node, Sequence) and len(node.items) in SIZES:
+            advice = f"add size: {len(node.items)} to {name} for a vector"
+            raise fault("E203", node.location, key, "a single value", form(node), advice=advice)
         nodes = list_of(node, key, size, "0") if size else (node,)
-        return [_number(node, name, unit, words) for node in nodes]
+        subjects = names_of(key, size) if size else (key,)
+        return [_number(*pair, unit, words) for pair in zip(nodes, subjects, strict=True)]
 
-    named = names_of(name, size)
-    values = body.read(key, read, [None] * len(named))
-    return tuple(zip(named, values, strict=True))
+    entry_names = names_of(name, size)
+    values = body.read(key, read, [None] * len(entry_names))
+    return tuple(zip(entry_names, values, strict=True))
 
 
 def _number(node: Node, subject: str, unit: Unit, words: Mapping[str, Fraction] | None = None) -> Fraction:
-    """Read a number of a declaration: a bare one is in the declared unit; or a word for one."""
+    """Return a number of a declaration in SI units: a plain number in the declared unit, a quantity, or
+    a word.
+
+    `words` has the values of the words.
+    """
     text = text_of(node, subject)
     if words and text in words:
         return words[text]

@@ -2,8 +2,8 @@
 
 Takes: YAML mappings, the components, and the enclosing scope. Gives: `PartEntry`, `PartEntries`,
 `EntryScope`; `read_entry`, the `PartBindings` of an entry; `Definitions`, `component_named`.
-Guarantees: every number, word, reference and connection required by a component exists, or an error reports
-it, once.
+Guarantees: every number, option, reference and connection required by a component exists, or one error
+reports that it is missing.
 Does not: handle the sections of a topology.
 """
 
@@ -28,7 +28,7 @@ from apc.compiler.components.component import (
     Reference,
     Settable,
 )
-from apc.compiler.errors import Mistakes, SourceLocation
+from apc.compiler.errors import Mistakes, SourceLocation, nearest
 from apc.compiler.language.dimensions import Dimension
 from apc.compiler.language.expression import format_expression
 from apc.compiler.language.grammar import parse_expression
@@ -63,7 +63,7 @@ Item = TypeVar("Item", bound=Settable)
 
 GROUND = "ground"
 LARGEST_ARRAY = 500
-# Of one peer, those inside parts included: half a minute and 1 GB of compiling.
+# Parts of one peer with inner parts: compiling this number takes half a minute and 1 GB.
 MOST_PARTS = 1000
 # The keys of every part of a topology in addition to its type.
 PART_KEYS = (
@@ -71,7 +71,7 @@ PART_KEYS = (
     "shared",
     "count",
 )
-# By section, an entry without its name; and a type to show for an entry that has none.
+# By section: the name of an example part, its entry, and the type proposed for an entry without a type.
 EXAMPLES = {
     "masses": ("device", "{mass: 0.1 kg}", "Mass"),
     "links": ("lan", "{clock: network}", "Link"),
@@ -79,6 +79,9 @@ EXAMPLES = {
     "hands": ("hand", "{type: ConstantForce}", "ConstantForce"),
     "parts": ("tip", "{type: Mass}", "Mass"),
 }
+SHORTEST_WORD = 4  # letters of a word that is searched in the names of components
+# Other words for an option, as of a distribution.
+_SYNONYMS = {"gauss": "normal", "gaussian": "normal"}
 _FAULTY = MappingNode((), SourceLocation(""))  # placeholder for an entry of a vector whose error was reported
 DEFAULT_TYPES = {"masses": "Mass", "links": "Link"}
 # A part, the first and last elements of an array, a connector.
@@ -93,32 +96,51 @@ class Definitions(Protocol):
 
     @property
     def component_names(self) -> tuple[str, ...]:
-        """The names of the components that can be asked for."""
+        """The names of all components."""
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Everything that can be asked for."""
+        """The names of all components and connector types."""
 
     def component(self, name: str) -> Component | None:
-        """Return a component, or None if there is no such name."""
+        """Return the component of a name, or None if there is none."""
 
     def connector(self, name: str) -> Connector | None:
-        """Return a connector type, or None if there is no such name."""
+        """Return the connector type of a name, or None if there is none."""
 
 
-def component_named(name: str, location: SourceLocation, library: Definitions, hint: str) -> Component:
-    """Return a component that is named at a place. Raises ApcError where there is none, or its mistakes."""
+def component_named(name: str, location: SourceLocation, library: Definitions, fix: str) -> Component:
+    """Return the component of a name that is written at `location`.
+
+    Raises ApcError if there is no such component, or with the mistakes of its definition.
+    """
     component = library.component(name)
     if component is not None:
         return component
     if name in library.names:
-        raise fault("E206", location, f"{name} is a connector type, not a component", hint=hint)
-    raise unknown("E206", location, f"there is no component {brief(name)}", name, library.component_names)
+        raise fault("E206", location, f"{name} is a connector type, not a component", fix=fix)
+    message, names = f"unknown component {brief(name)}", library.component_names
+    if close := _name_with_word(name, names):
+        raise fault("E206", location, f"{message}; the nearest is {close}", fix=close)
+    raise unknown("E206", location, message, name, names)
+
+
+def _name_with_word(word: str, names: Collection[str]) -> str:
+    """Return the shortest name that starts with a word, or else contains it, in any case of the letters.
+
+    The result is empty if there is none: `average` is a word of AveragePosition.
+    """
+    word = word.lower()
+    starting, containing = (
+        [name for name in names if word in name.lower()[: len(word) if at_start else None]]
+        for at_start in (True, False)
+    )
+    return min(starting or containing, key=len, default="") if len(word) >= SHORTEST_WORD else ""
 
 
 @dataclass(frozen=True, slots=True)
 class PartEntry:
-    """A part's entry before it is read; `count` is None for one that is no array."""
+    """A part's entry before it is read; `count` is None for a part that is no array."""
 
     name: str
     section: str
@@ -129,11 +151,17 @@ class PartEntry:
 
     @property
     def words(self) -> set[str]:
-        """The meaning of its keys in one word."""
+        """The values of the entry that are texts."""
         return {value.text for _, value in self.body.entries if isinstance(value, Scalar)}
 
+    @property
+    def is_shared(self) -> bool:
+        """Whether the entry is that of a shared object."""
+        shared = self.body.get("shared")
+        return isinstance(shared, Scalar) and shared.value is True
+
     def connectors(self, kind: str) -> list[str]:
-        """Return its connectors of a type."""
+        """Return the names of the connectors of a type."""
         return [name for name, connector_type in self.component.connectors if connector_type.name == kind]
 
 
@@ -141,8 +169,8 @@ class PartEntry:
 class PartEntries:
     """The parts of a topology or component, section by section, before their entries are read.
 
-    `entries` are those of a known component; `faulty` names parts that are there and can't be read, which
-    was reported. `used` are names that nothing may have again, None inside a component.
+    `entries` are the parts with a valid component; `faulty` the names of parts with an error that was
+    reported. `used` are the names that are already used, None inside a component.
     """
 
     library: Definitions
@@ -152,12 +180,12 @@ class PartEntries:
     faulty: set[str] = field(default_factory=set)
 
     def read(self, section: str, root: MappingReader) -> None:
-        """Collect the parts of a section and their components, so that names can be resolved."""
+        """Add the parts of a section, with their components, to `entries`."""
         name, example, _ = EXAMPLES[section]
         subject, words = ("a part", ()) if self.used is None else (f"a part of {section}", RESERVED)
         for key, value in root.section(section, f"{{{name}: {example}}}"):
             if key.text not in self.entries:
-                self.faulty.add(key.text)  # until it has been read
+                self.faulty.add(key.text)  # removed once the entry is valid
             with self.mistakes:
                 body = mapping_of(value, key.text, f"{key.text}: {example}")
                 name_of(key, subject, self.used or (), "this topology", words)
@@ -171,27 +199,31 @@ class PartEntries:
                     self.used.add(key.text)
 
     def _component(self, section: str, key: Scalar, body: MappingNode) -> Component:
-        """Return the component that an entry is of."""
+        """Return the component of an entry. Raises ApcError for a missing or unknown type."""
         node, name, typical = body.get("type"), DEFAULT_TYPES.get(section), EXAMPLES[section][-1]
-        hint = f"type: {typical}"
+        fix = f"type: {typical}"
         if node is not None:
-            name = text_of(node, "type", hint)
+            name = text_of(node, "type", fix)
         if name is None:
-            hint = hint if section == "parts" else f"type: {self._example(section, body, typical)}"
-            raise fault("E201", key.location, f"{key.text} has no type", hint=hint)
-        return component_named(name, (node or key).location, self.library, hint)
+            fix = fix if section == "parts" else f"type: {self._example(section, body, typical)}"
+            raise fault("E201", key.location, f"{key.text} has no type", fix=fix)
+        return component_named(name, (node or key).location, self.library, fix)
 
     def _example(self, section: str, body: MappingNode, typical: str) -> str:
-        """Return a type to propose for an entry without one: with its keys, and as few others as can be."""
-        keys, fitting = {*body.keys()} - {*PART_KEYS}, []
+        """Return the component type to propose for an entry without a type.
+
+        The type has all keys of the entry, and as few others as possible; `typical` is the section's most
+        common type.
+        """
+        keys, candidates = {*body.keys()} - {*PART_KEYS}, []
         for name in self.library.component_names:
-            with Mistakes():  # which are reported where it is asked for
+            with Mistakes():  # errors of a definition are reported when an entry uses it
                 if (component := self.library.component(name)) is not None:
                     connectors = {connector for connector, _ in component.connectors}
                     known = connectors | {item.name for item in (*component.parameters, *component.variables)}
                     if known >= keys and (section != "hands" or connectors == {"flange"}):
-                        fitting.append((name != typical, len(known), name))
-        return min(fitting, default=(True, 0, typical))[-1]
+                        candidates.append((name != typical, len(known), name))
+        return min(candidates, default=(True, 0, typical))[-1]
 
 
 def _count(name: str, section: str, body: MappingNode) -> int | None:
@@ -201,18 +233,19 @@ def _count(name: str, section: str, body: MappingNode) -> int | None:
     count, link = whole_number(node), section == "links"
     if not link and count in range(1, LARGEST_ARRAY + 1):
         return count
-    expected = "no count, as a link is one" if link else f"a whole number from 1 to {LARGEST_ARRAY}"
-    raise fault("E208", node.location, f"the count of {name}", expected, form(node))
+    expected = "none, as a link can't be an array" if link else f"a whole number from 1 to {LARGEST_ARRAY}"
+    raise fault("E208", node.location, f"count of {name}", expected, form(node))
 
 
 @dataclass(frozen=True, slots=True)
 class EntryScope:
     """The names that an entry can refer to.
 
-    `dimension` and `names` are the names an expression may use; `references` returns the names of a role, for
-    a word, or raises the error of their section; `parts` are the connectable parts; `whole` is the context of
-    the entry, in words; `complete` is False when a whole section of parts is missing or faulty and was
-    reported; `outer` is the component around it, if there is one.
+    `dimension` returns the dimension of a name in an expression, and `names` are these names; `references`
+    returns the clocks, links or tables for a role and a word, or raises the error of their section; `parts`
+    are the parts that can be connected; `whole` is the text of the context in messages; `complete` is False
+    if a section of parts is missing or invalid, which was reported; `outer` is the enclosing component, None
+    in a topology.
     """
 
     dimension: Callable[[tuple[str, ...]], Dimension | None]
@@ -225,46 +258,50 @@ class EntryScope:
 
 
 def read_entry(entry: PartEntry, scope: EntryScope, mistakes: Mistakes, index: int = 1) -> PartBindings:
-    """Read the entry of a part.
+    """Return the values, options, references, start values and connections of a part's entry.
 
     Parameters
     ----------
     entry
         The entry in the topology, with its component.
     scope
-        The names that it can refer to.
+        The names that the entry can refer to.
     mistakes
         The collector of errors.
     index
-        The index of the element in its array.
+        The index of the element in an array of parts, from 1.
     """
     component, within = entry.component, scope.outer
-    # What names something; inside a component, a table is one of the outer's.
-    naming = ("clock", "link") if within is None else ("clock", "link", "table")
+    # The roles of references by name; inside a component, a table is a reference to a table of the outer
+    # part.
+    named_roles = ("clock", "link") if within is None else ("clock", "link", "table")
     starts = [variable for variable in component.variables if variable.start is not None]
-    named = (whole_and_index(item.name)[0] for item in (*component.parameters, *starts))
+    settable_names = (whole_and_index(item.name)[0] for item in (*component.parameters, *starts))
     common = PART_KEYS if within is None else ("count",)
-    keys = dict.fromkeys(("type", *common, *dict(component.connectors), *named))
+    keys = dict.fromkeys(("type", *common, *dict(component.connectors), *settable_names))
     nodes = MappingReader(entry.body, keys, f"{entry.name} ({component.name})", mistakes).nodes
     numbers: tuple[NumberParameter | ComponentVariable, ...] = (*component.numbers, *starts)
     for name, vector in by_vector(numbers).items():
         if len(vector) > 1 and name in nodes:  # a key for each entry, x[1], instead of x: [1 m, 0 m]
             values: tuple[Node, ...] = (_FAULTY,) * len(vector)
             with mistakes:
-                values = _vector(nodes[name], name, vector, scope)
+                values = _vector_nodes(nodes[name], name, vector, scope)
             nodes.update(zip((item.name for item in vector), values, strict=True))
 
-    def due(parameter: Parameter) -> str:
+    def suggestion(parameter: Parameter) -> str:
         """Return the suggested text for a required parameter; empty for an optional one."""
         if isinstance(parameter, Reference):
-            texts = scope.references(parameter.role, "") if parameter.role in naming else [""]
+            texts = scope.references(parameter.role, "") if parameter.role in named_roles else [""]
             return next(iter(texts), "name")
         if parameter.default is not None:
             return ""
         return parameter.words[0] if isinstance(parameter, Option) else _single(parameter.unit)
 
     def number(item: NumberParameter | ComponentVariable) -> ValueBinding | None:
-        """Return a parameter's number, the default of one that isn't given, or a variable's start value."""
+        """Return the value of a parameter, its default if missing, or the start value of a variable.
+
+        The result is None if the value is missing or invalid.
+        """
         node, unit, words = nodes.get(item.name), item.unit, Named[Fraction]()
         if isinstance(item, NumberParameter):
             words = item.words
@@ -276,32 +313,43 @@ def read_entry(entry: PartEntry, scope: EntryScope, mistakes: Mistakes, index: i
         return read_binding(node, *message, *pair, words)
 
     def option(item: Option) -> str | None:
+        """Return the word of an option, its default if missing. Raises ApcError for an unknown word."""
         name, words, node = item.name, item.words, nodes.get(item.name)
         if node is None:
             return item.default
         word = text_of(node, name, f"{name}: {words[0]}")
         if word in words:
             return word
-        hint = f"{name}: {item.default or words[0]}"
-        raise fault("E206", node.location, name, " or ".join(words), brief(word), hint)
+        close = _SYNONYMS.get(word.lower()) or nearest(word, words)
+        fix = f"{name}: {close}" if close in words else ""
+        raise fault(
+            "E206",
+            node.location,
+            name,
+            " or ".join(filter(None, (", ".join(words[:-1]), words[-1]))),
+            brief(word),
+            fix,
+        )
 
     def reference(item: Reference) -> str | None:
+        """Return the name of a referenced clock, link or table; None if it is missing or only described."""
         name, role, node = item.name, item.role, nodes.get(item.name)
-        if node is None or role not in naming:
+        if node is None or role not in named_roles:
             return None
         word = text_of(node, name)
         outer = None if within is None else within.parameter(word)
         if isinstance(outer, Reference) and item.unit is not None and outer.unit is not None:
-            # A table handed on to a part inside: only here do the two units meet.
+            # A table of the outer part is passed to an inner part: the two units must have the same
+            # dimension.
             if outer.unit.dimension != item.unit.dimension:
                 raise fault("E204", node.location, name, item.unit.text, outer.unit.text)
             return word
-        missing = f"isn't in {role}s" if within is None else f"is no {role} of {within.name}"
-        message = f"{entry.name} names {role} {{}}, which {missing}"
+        missing = f"not in {role}s" if within is None else f"not a {role} of {within.name}"
+        message = f"{entry.name}: unknown {role} {{}} ({missing})"
         return among(word, scope.references(role, word), node.location, message)
 
-    def each(items: Iterable[Item], read: Callable[[Item], T | None]) -> Named[T]:
-        """Return the results of reading items by name, invalid ones omitted."""
+    def read_all(items: Iterable[Item], read: Callable[[Item], T | None]) -> Named[T]:
+        """Return the values of items by name; missing and invalid items are omitted."""
         pairs = []
         for item in items:
             with mistakes:
@@ -311,40 +359,43 @@ def read_entry(entry: PartEntry, scope: EntryScope, mistakes: Mistakes, index: i
 
     missing = dict[str, str]()
     for name, parameters in by_vector(component.parameters).items():
-        requested = [due(parameter) for parameter in parameters if parameter.name not in nodes]
-        if any(requested):
-            missing[name] = requested[0] if len(requested) == 1 else f"[{', '.join(requested)}]"
+        suggestions = [suggestion(parameter) for parameter in parameters if parameter.name not in nodes]
+        if any(suggestions):
+            missing[name] = suggestions[0] if len(suggestions) == 1 else f"[{', '.join(suggestions)}]"
     if missing:
-        hint = ", ".join(f"{key}: {value}" for key, value in missing.items())
+        fix = ", ".join(f"{key}: {value}" for key, value in missing.items())
         message = f"{entry.name} has no {enumerated(tuple(missing))}"
-        mistakes.add("E201", entry.location, message, hint=hint)
+        mistakes.add("E201", entry.location, message, fix=fix)
     references = [parameter for parameter in component.parameters if isinstance(parameter, Reference)]
-    described = (reference.name for reference in references if reference.role not in naming)
+    described = (reference.name for reference in references if reference.role not in named_roles)
     connections = []
     for name, kind in component.connectors:
         with mistakes:
-            if joined := _joined(name, kind.name, nodes.get(name), entry, scope, index):
-                connections.append((name, *joined))
+            if target := _connection_target(name, kind.name, nodes.get(name), entry, scope, index):
+                connections.append((name, *target))
     targets = [(part, connector_type) for _, part, connector_type in connections if part != GROUND]
     if len(targets) > 1 and len(set(targets)) == 1:
-        mistakes.add("E210", entry.location, f"{entry.name} joins {targets[0][0]} to itself")
+        mistakes.add("E210", entry.location, f"{entry.name} connects {targets[0][0]} to itself")
     return PartBindings(
-        each(component.numbers, number),
-        each((parameter for parameter in component.parameters if isinstance(parameter, Option)), option),
-        each(references, reference),
+        read_all(component.numbers, number),
+        read_all((parameter for parameter in component.parameters if isinstance(parameter, Option)), option),
+        read_all(references, reference),
         tuple((name, nodes[name]) for name in described if name in nodes),
-        each(starts, number),
+        read_all(starts, number),
         tuple(connections),
     )
 
 
-def _vector(
+def _vector_nodes(
     node: Node, name: str, vector: Sequence[NumberParameter | ComponentVariable], scope: EntryScope
 ) -> tuple[Node, ...]:
-    """Return a node for each entry of a vector, which inside a component may be an expression."""
+    """Return one node for each entry of a vector. Raises ApcError for a wrong number of entries.
+
+    Inside a component the vector may be an expression over vectors of the outer part.
+    """
     if isinstance(node, Scalar) and scope.outer is not None and not is_quantity(node.text):
         location = text_location(node)
-        sizes = sizes_of(tuple(name.split(".")) for name in scope.names)
+        sizes = sizes_of(tuple(known.split(".")) for known in scope.names)
         tree = parse_expression(node.text, location)
         result = written_out(tree, lambda parts: sizes.get(parts, 0), node.text, location)
         if result is not None and len(result) == len(vector):
@@ -352,43 +403,70 @@ def _vector(
     return list_of(node, name, len(vector), _single(vector[0].unit))
 
 
-def _joined(
+def _connection_target(
     connector: str, kind: str, node: Node | None, entry: PartEntry, scope: EntryScope, index: int
 ) -> tuple[str, str] | None:
-    """Return the part and the connector of it that a connector, of a type, of an entry is joined to."""
+    """Return the part and the connector that a connector of an entry is connected to.
+
+    Parameters
+    ----------
+    connector, kind
+        The connector of the entry, and its connector type.
+    node
+        The value of the connector's key; None if the key is missing.
+    entry, scope
+        The entry, and the names that it can refer to.
+    index
+        The index of the element in an array of parts, from 1.
+
+    Returns
+    -------
+    None if the connector may remain unconnected; ("ground", "") for the ground; ("", connector) for a
+    connector of the enclosing component.
+
+    Raises
+    ------
+    ApcError
+        The connection is missing or invalid.
+    """
     name, outer, parts = entry.name, scope.outer, scope.parts.entries
     if node is None:
-        # A mass need not be joined, nor what another entry is joined to.
+        # A mass, an inner part, or a connector named by another entry needs no connection of its own.
         if entry.section in ("masses", "parts") or any(
             f"{name}.{connector}" in other.words for other in parts.values()
         ):
             return None
         free = (part for part in parts.values() if part.name not in {name, *entry.words})
         fitting = (part.name for part in free if part.connectors(kind))
-        message = f"{name} does not say what its {connector} is joined to"
-        hint = f"{connector}: {next(fitting, GROUND)}"
-        for item in parts.values():  # who joins the part without saying which of its connectors is meant
+        message = f"connector {connector} of {name} is not connected"
+        fix = f"{connector}: {next(fitting, GROUND)}"
+        for item in parts.values():  # an entry connected to the part without a named connector
             for key, value in item.body.entries:
                 if isinstance(value, Scalar) and value.text == name and key.text in item.connectors(kind):
-                    hint = f"{item.name}: {{{key.text}: {name}.{connector}}}"
-        raise fault("E210", entry.location, message, hint=hint)
+                    fix = f"{item.name}: {{{key.text}: {name}.{connector}}}"
+        raise fault("E210", entry.location, message, fix=fix)
     text = text_of(node, connector, f"{connector}: device")
     if text == GROUND:
         return GROUND, ""
     if outer is not None and text in dict(outer.connectors):
         return "", text
     if (result := _TARGET.match(text)) is None:
-        expected = "a part, such as device, device.flange or chain[2]"
+        expected = "a part or connector, such as device, device.flange or chain[2]"
         raise fault("E210", node.location, connector, expected, brief(text))
     other, first, last, named = result.groups()
     part = parts.get(other)
     if other in scope.parts.faulty or (part is None and not scope.complete):
         raise AlreadyReportedError
     if part is None:
-        message = f"{name} joins its {connector} to {brief(other)}, which is no part of {scope.whole}"
-        raise unknown(
-            "E206", node.location, message, other, [*(part for part in parts if part != name), GROUND]
-        )
+        message = f"{connector} of {name}: {brief(other)} is not a part of {scope.whole}"
+        others = [part for part in parts.values() if part.name != name and part.connectors(kind)]
+        names = [*(part.name for part in others), GROUND]
+        if entry.component.receives_from_others:  # a coupler of copies: the objects only, shared ones first
+            objects = [part for part in others if part.section == "masses"]
+            names = [part.name for part in [one for one in objects if one.is_shared] or objects]
+        raise unknown("E206", node.location, message, other, names)
+    if part.name == name and named is None and len(part.connectors(kind)) > 1:
+        raise fault("E210", node.location, f"{connector} of {name}", "another part", name)
     element = _element(part, first, last, entry, index, connector, node.location)
     return element, _matching_connector(part, named, connector, kind, entry.section == "hands", node.location)
 
@@ -402,43 +480,83 @@ def _element(
     connector: str,
     at: SourceLocation,
 ) -> str:
-    """Return the part that an entry is joined to; of an array from `first` to `last`, the element."""
-    other, size, message, hint = part.name, part.count, "", ""
+    """Return the name of the connected part, or of the connected element of an array.
+
+    Parameters
+    ----------
+    part
+        The part that is connected.
+    first, last
+        The written indices of the first and last element of an array, None if not written.
+    entry, index
+        The entry that contains the connection, and the index of its element.
+    connector
+        The connector of the entry.
+    at
+        The place of the connection, for messages.
+
+    Raises
+    ------
+    ApcError
+        The indices do not match the array.
+    """
+    other, size, message, fix = part.name, part.count, "", ""
     if size is None and first is None:
         return other
     low, high = int(first or 1), int(last or first or size or 0)
     if size is None:
-        message, hint = f"{other} is one part, not an array", f"{connector}: {other}"
+        message, fix = f"{other} is a single part, not an array", f"{connector}: {other}"
     elif not 1 <= low <= high <= size:
-        message = f"{other} is an array of {size}: its elements are {other}[1] to {other}[{size}]"
+        shown = f"{low}" if low == high else f"{low}:{high}"
+        message = f"index of {other}: expected 1 to {size}, got {shown}"
     elif low == high and first:
         return f"{other}[{low}]"
     elif entry.count == high - low + 1:
         return f"{other}[{low + index - 1}]"
     else:
-        mine = "one part" if entry.count is None else f"an array of {entry.count}"
+        mine = "a single part" if entry.count is None else f"an array of {entry.count}"
         message = f"{entry.name} is {mine} and {other}[{low}:{high}] has {high - low + 1} elements"
-        hint = f'{connector}: "{other}[1]"'
-    raise fault("E210", at, message, hint=hint)
+        elements = f"1:{entry.count}" if entry.count and entry.count <= size else "1"
+        fix = f'{connector}: "{other}[{elements}]"'
+    raise fault("E210", at, message, fix=fix)
 
 
 def _matching_connector(
     part: PartEntry, named: str | None, connector: str, kind: str, by_hand: bool, at: SourceLocation
 ) -> str:
-    """Return the connector of another part that is named, or meant where none is."""
+    """Return the connector of the connected part: the connector named, else the only one of the same type.
+
+    Parameters
+    ----------
+    part
+        The part that is connected.
+    named
+        The name of its connector, None if not written.
+    connector, kind
+        The connector of the entry, and its connector type.
+    by_hand
+        Whether the entry is a hand, which is connected to connectors for hands first.
+    at
+        The place of the connection, for messages.
+
+    Raises
+    ------
+    ApcError
+        No connector, or more than one, is possible.
+    """
     shown, fitting = f"{part.name} ({part.component.name})", part.connectors(kind)
-    meant = [name for name in fitting if (name in part.component.grips) == by_hand] or fitting
+    preferred = [name for name in fitting if (name in part.component.grips) == by_hand] or fitting
     if named is not None:
-        return among(named, fitting, at, f"{shown} has no {kind} called {{}}")
-    if len(meant) == 1:
-        return meant[0]
-    message, hint = f"{shown} has no connector of type {kind} to join {connector} to", ""
+        return among(named, fitting, at, f"{shown} has no connector {{}} of type {kind}")
+    if len(preferred) == 1:
+        return preferred[0]
+    message, fix = f"{connector}: expected a part with a connector of type {kind}, got {shown}", ""
     if fitting:
         message = f"{shown} has {len(fitting)} connectors of type {kind}"
-        hint = f"{connector}: {part.name}.{fitting[0]}"
-    raise fault("E210", at, message, hint=hint)
+        fix = f"{connector}: {part.name}.{fitting[0]}"
+    raise fault("E210", at, message, fix=fix)
 
 
 def _single(unit: Unit) -> str:
-    """Return a number in a unit, to show in a message."""
+    """Return the text of a number in a unit, as an example in messages."""
     return f"1 {unit.text}".removesuffix(" 1")

@@ -2,13 +2,13 @@
 
 Takes: equations as residuals, and the unknowns. Gives: `solve_blocks`: assignments and `ImplicitBlock`s;
 `balanced`, the blocks alone.
-Guarantees: every unknown is assigned once, from earlier assignments; linear blocks come out explicit.
+Guarantees: every unknown is assigned once, from earlier assignments; linear blocks are solved explicitly.
 Does not: differentiate anything (see `index`), or handle states and clocks.
 
-Matched and sorted by `matching`, as usual in Modelica compilers (Cellier and Kofman, Continuous System
-Simulation, ch. 7); a block of linear equations is solved by `elimination`. A nonlinear loop is left to an
-iteration over few unknowns, from which the others follow one by one: it is torn (Elmqvist and Otter, Methods
-for tearing systems of equations in object-oriented modeling, 1994).
+Equations are matched and sorted by `matching`, as usual in Modelica compilers (Cellier and Kofman, Continuous
+System Simulation, ch. 7); a block of linear equations is solved by `elimination`. A nonlinear loop is reduced
+by tearing to an iteration over few unknowns, and the other unknowns are computed in sequence (Elmqvist and
+Otter, Methods for tearing systems of equations in object-oriented modeling, 1994).
 """
 
 from __future__ import annotations
@@ -47,39 +47,40 @@ from apc.compiler.equations.terms import (
 )
 from apc.compiler.wording import counted
 
-# A loop of more guesses isn't asked whether it has one solution, nor more pieces of it between its corners.
-MOST_GUESSES, MOST_PIECES = 3, 64
+# Loops with more tearing unknowns, and further smooth pieces of a determinant, are not tested for unique
+# solutions.
+MOST_TEARING, MOST_PIECES = 3, 64
 T = TypeVar("T")
 
 
 def solve_blocks(
     residuals: Sequence[Residual], unknowns: Sequence[Symbol], problem: Problem
 ) -> tuple[Step, ...]:
-    """Match, sort and solve.
+    """Return the solution of equations, in order of evaluation: assignments and implicit blocks.
 
     Parameters
     ----------
     residuals, unknowns
         As many equations as unknowns.
     problem
-        Collects E503 a loop without an unknown to solve for, E511 linear equations that depend on each other,
-        E512 a constant that is no number.
+        The test of divisors and the collector of errors: E503 a loop without an unknown to solve for, E511
+        linearly dependent equations, E512 a constant that is not a number.
 
     Raises
     ------
     ApcError
-        E502 equations or unknowns left over.
+        E502 unmatched equations or unknowns.
     """
     known = frozenset(unknowns)
-    held = [residual.expression.free_symbols & known for residual in residuals]
+    incidence = [residual.expression.free_symbols & known for residual in residuals]
     steps: list[Step] = []
-    for rows, local in balanced(residuals, held, unknowns, problem):
+    for rows, block_unknowns in balanced(residuals, incidence, unknowns, problem):
         block = [residuals[row] for row in rows]
         with problem.mistakes:
-            solved = _solved(block, local, problem)
+            solved = _block_solution(block, block_unknowns, problem)
             parts = [step.expressions if isinstance(step, ImplicitBlock) else step[1:] for step in solved]
             if any(is_no_number(expression) for part in parts for expression in part):
-                raise problem.no_number(block)  # what was divided may cancel
+                raise problem.no_number(block)  # an undefined constant may result from the division
             steps += solved
     return tuple(steps)
 
@@ -87,24 +88,24 @@ def solve_blocks(
 def balanced(
     residuals: Sequence[Residual], held: Sequence[Collection[T]], unknowns: Sequence[T], problem: Problem
 ) -> list[Block[T]]:
-    """Return the strongly connected blocks, in order, of equations solved for their unknowns.
+    """Return the strongly connected blocks of equations and unknowns, in order of evaluation.
 
     Parameters
     ----------
     residuals
         The equations.
     held, unknowns
-        As `match` takes them; unknowns are shown by their text.
+        The unknowns of each equation, and all unknowns, as in `match`; messages contain their texts.
     problem
-        The names of the equations.
+        The context of the equations for messages.
 
     Raises
     ------
     ApcError
-        E502 which equations and which unknowns are too many.
+        E502 unmatched equations or unknowns.
     """
-    left_over, over, under, blocks = match(held, unknowns)
-    if not (left_over or under[1]):
+    unmatched_rows, over, under, blocks = match(held, unknowns)
+    if not (unmatched_rows or under[1]):
         return blocks
     parts = []
     (too_many, theirs), (holding, open_) = (
@@ -112,54 +113,57 @@ def balanced(
     )
     if too_many:
         only = f"only {counted(len(theirs), 'unknown')} ({listed(theirs)})" if theirs else "no unknown"
-        verb = "holds" if len(too_many) == 1 else "hold"
+        verb = "contains" if len(too_many) == 1 else "contain"
         parts.append(f"{counted(len(too_many), 'equation')} {verb} {only}: {listed(too_many)}")
     if open_:
         by = f"only {counted(len(holding), 'equation')}, {listed(holding)}" if holding else "no equation"
         has = "has" if len(open_) == 1 else "have"
         parts.append(f"{counted(len(open_), 'unknown')} ({listed(open_)}) {has} {by}")
     message = f"{problem.where} can't be solved: {'; and '.join(parts)}"
-    raise problem.fault("E502", [residuals[i] for i in left_over] or residuals, message)
+    raise problem.fault("E502", [residuals[i] for i in unmatched_rows] or residuals, message)
 
 
-def _solved(block: Sequence[Residual], unknowns: Sequence[Symbol], problem: Problem) -> Sequence[Step]:
-    """Return the solution of one block, explicit if linear."""
+def _block_solution(
+    block: Sequence[Residual], unknowns: Sequence[Symbol], problem: Problem
+) -> Sequence[Step]:
+    """Return the solution of one block: assignments if all equations are linear, else an implicit block."""
     known = frozenset(unknowns)
     linear = [form for residual in block if (form := linear_form(residual.expression, known)) is not None]
     if len(linear) == len(block):
         steps, free = eliminate(linear, unknowns, problem.divisors)
         if free:
-            message = f"depend on each other and don't determine {listed([item.name for item in free])}"
+            message = f"are linearly dependent and do not determine {listed([item.name for item in free])}"
             raise problem.fault("E511", block, f"{problem.where} {message}: {listed(block)}")
         return steps
-    loop = _torn(block, unknowns, problem.divisors)
+    loop = _tear(block, unknowns, problem.divisors)
     residuals = loop.residuals
     for name, value in reversed(loop.inner if len(loop.inner) <= MOST_LISTED else ()):
         residuals = tuple(residual.xreplace({symbol(name): value}) for residual in residuals)
     fault = ""
     if not all(residual.free_symbols for residual in residuals):
-        fault = "hold a loop without an unknown left to solve for"
+        fault = "contain an algebraic loop without an unknown"
     elif _is_open(residuals, [symbol(name) for name in loop.tearing], problem.divisors):
-        fault = "hold a loop that many values solve, or none"
+        fault = "contain a singular algebraic loop"
     if fault:
         message = f"{problem.where} {fault}: {loop.chain}, by {listed(block)}"
         raise problem.fault("E503", block, message)
     return (loop,)
 
 
-def _torn(block: Sequence[Residual], unknowns: Sequence[Symbol], divisors: Divisors) -> ImplicitBlock:
-    """Tear a block: a heuristic for few iteration variables, from which the others follow one by one.
+def _tear(block: Sequence[Residual], unknowns: Sequence[Symbol], divisors: Divisors) -> ImplicitBlock:
+    """Return a nonlinear block with few tearing unknowns, chosen by a heuristic, from which the others are
+    computed.
 
-    When no equation computes an unknown, the open unknown in most of the open equations is torn, of several
-    the one that fewest of them could compute. A computed unknown is linear in its equation, with a factor
-    that is free of the loop's unknowns and isn't zero for all values.
+    If no equation determines an unknown, the unknown in most of the remaining equations becomes a tearing
+    unknown; of several the one that the fewest equations could determine. A computed unknown is linear in its
+    equation, with a factor that contains no unknown of the block and isn't zero for all values.
     """
     members = frozenset(unknowns)
-    holds = [residual.expression.free_symbols & members for residual in block]
+    incidence = [residual.expression.free_symbols & members for residual in block]
 
     @functools.cache
     def solved(i: int, unknown: Symbol) -> Term | None:
-        """Return an unknown from an equation, None if it cannot be determined."""
+        """Return the value of an unknown by equation i, or None if the equation does not determine it."""
         form = linear_form(block[i].expression, {unknown})
         factor = form[0].get(unknown, ZERO) if form else ZERO
         if form is None or factor.free_symbols & members or divisors.is_zero(factor):
@@ -167,40 +171,46 @@ def _torn(block: Sequence[Residual], unknowns: Sequence[Symbol], divisors: Divis
         return -form[1] / factor
 
     def gain(unknown: Symbol) -> tuple[int, int]:
-        rows = [i for i in left if unknown in holds[i]]
+        """Return the rank of a tearing unknown: number of its equations, minus the number that
+        determine it.
+        """
+        rows = [i for i in open_rows if unknown in incidence[i]]
         return len(rows), -sum(solved(i, unknown) is not None for i in rows)
 
-    left, remaining = dict.fromkeys(range(len(block))), dict.fromkeys(unknowns)
+    open_rows, remaining = dict.fromkeys(range(len(block))), dict.fromkeys(unknowns)
     inner: list[Assignment] = []
     torn: list[Symbol] = []
     while remaining:
-        single = ((i, *still) for i in left if len(still := holds[i] & remaining.keys()) == 1)
+        single = ((i, *still) for i in open_rows if len(still := incidence[i] & remaining.keys()) == 1)
         ready = next((pair for pair in single if solved(*pair) is not None), None)
         if ready is None:
             torn.append(max(remaining, key=gain))
             del remaining[torn[-1]]
         else:
             inner.append((ready[1].name, solved(*ready)))
-            del left[ready[0]], remaining[ready[1]]
-    names, guesses = (tuple(item.name for item in some) for some in (unknowns, torn))
-    return ImplicitBlock(names, guesses, tuple(inner), tuple(block[i].expression for i in left))
+            del open_rows[ready[0]], remaining[ready[1]]
+    names, tearing = (tuple(item.name for item in symbols) for symbols in (unknowns, torn))
+    return ImplicitBlock(names, tearing, tuple(inner), tuple(block[i].expression for i in open_rows))
 
 
 def _is_open(residuals: Sequence[Term], guesses: Sequence[Symbol], divisors: Divisors) -> bool:
-    """Return whether between corners the residuals don't depend on the guesses, or only on some."""
-    if len(guesses) > MOST_GUESSES:
+    """Return whether a nonlinear block has no unique solution: its Jacobian is singular on a smooth piece.
+
+    `guesses` are the tearing unknowns; False if there are too many or a derivative does not exist.
+    """
+    if len(guesses) > MOST_TEARING:
         return False
     try:
         slopes = sympy.Matrix([[slope(residual, guess) for guess in guesses] for residual in residuals])
     except NoDerivativeError:
         return False
-    with dotprodsimp(False):  # which would expand it
+    with dotprodsimp(False):  # the simplification would expand the determinant
         pieces = islice(_pieces(slopes.det(method="laplace")), MOST_PIECES)
     return any(divisors.is_zero(piece) or divisors.vanishes(piece) for piece in pieces)
 
 
 def _pieces(term: Term) -> Iterator[Term]:
-    """Yield the smooth pieces of a term, one for each choice of branches and signs."""
+    """Yield the smooth pieces of a term: one for each choice of branches and signs."""
     node = next((item for item in sympy.preorder_traversal(term) if isinstance(item, If | sympy.sign)), None)
     if node is None:
         yield term

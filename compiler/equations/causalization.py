@@ -1,4 +1,4 @@
-"""Causalization: partitions balanced, aliases removed, index reduced, matched, sorted and solved.
+"""Causalization: alias elimination, index reduction, matching, sorting and solution of each partition.
 
 Takes: `ClockedSystem`. Gives: `sort`, a `SortedSystem` of `SortedPeerType`s: assignments in the order in
 which they can be computed, with nonlinear loops as `ImplicitBlock`s.
@@ -6,8 +6,8 @@ Guarantees: every unknown of a partition is assigned once, from states, crossing
 assigned before it.
 Does not: substitute parameter values, or drop unused variables.
 
-Variables joined rigidly are one state. The start value that counts is that of the state kept: of the
-variables with a start value the one named first; those of the others are ignored.
+Rigidly coupled variables have one state: of the variables with a start value, the first one. The start values
+of the other variables are ignored.
 """
 
 from __future__ import annotations
@@ -45,9 +45,9 @@ from apc.compiler.topology.topology import Topology
 
 @dataclass(frozen=True, slots=True)
 class SortedPartition:
-    """The unknowns of one clock (or the continuous ones), in the order in which they can be computed.
+    """The unknowns of one clock (or the continuous unknowns), in the order in which they can be computed.
 
-    A step is a pair of a name and the expression that gives it, or the `ImplicitBlock` of a nonlinear loop.
+    A step is a pair of a name and the expression of its value, or the `ImplicitBlock` of a nonlinear loop.
     """
 
     clock: str
@@ -56,7 +56,7 @@ class SortedPartition:
 
 @dataclass(frozen=True, slots=True)
 class SortedSend:
-    """A send over a link, as an expression in continuous unknowns."""
+    """A value sent over a link, as an expression in continuous unknowns."""
 
     name: str
     link: str
@@ -66,7 +66,12 @@ class SortedSend:
 
 @dataclass(frozen=True, slots=True)
 class SortedPeerType:
-    """A peer type as explicit equations. `aliases` are unknowns that equal ± another, or zero."""
+    """A peer type as explicit equations.
+
+    `aliases` are unknowns that equal another unknown, its negative, or zero. `partitions` are the steps of
+    each clock, first of the continuous unknowns; `samples` and `sends` are expressions in continuous
+    unknowns; `receives` are the reductions over received values.
+    """
 
     clocked: ClockedPeerType
     states: tuple[str, ...]
@@ -78,7 +83,7 @@ class SortedPeerType:
 
     @property
     def definitions(self) -> dict[Symbol, Definition]:
-        """The assignment of each unknown and each sample."""
+        """The definition of each unknown and each sample: a term or an implicit block."""
         result: dict[str, Definition] = {}
         for step in (step for part in self.partitions for step in part.assignments):
             result |= dict.fromkeys(step.unknowns, step) if isinstance(step, ImplicitBlock) else dict([step])
@@ -94,25 +99,33 @@ class SortedSystem:
 
 
 def sort(clocked: ClockedSystem) -> SortedSystem:
-    """Sort and solve every partition. Raises ApcError naming the equations and unknowns left over."""
+    """Return the explicit equations of all peer types, partition by partition.
+
+    Raises ApcError with all errors, such as unmatched equations and unknowns.
+    """
     topology = clocked.topology
     mistakes = Mistakes(topology.names)
     peer_types = []
     for peer_type in clocked.peer_types:
-        nonzero = {symbol("peers")} | {  # the parameters that no number can make zero
+        nonzero = {symbol("peers")} | {  # the parameters that must be positive
             symbol(f"{part.name}.{declared.name}")
             for part in peer_type.flat.parts
             for declared in part.component.numbers
             if declared.exclusive_minimum and declared.minimum == 0
         }
         with mistakes:
-            peer_types.append(_sorted(peer_type, Divisors(nonzero, _numbers(topology, peer_type)), mistakes))
+            peer_types.append(
+                _sorted_peer_type(peer_type, Divisors(nonzero, _numbers(topology, peer_type)), mistakes)
+            )
     mistakes.raise_if_any()
     return SortedSystem(topology, tuple(peer_types))
 
 
 def _numbers(topology: Topology, peer_type: ClockedPeerType) -> list[dict[Symbol, Given]]:
-    """Return the numbers of each group of a peer type, those that differ from peer to peer as they do."""
+    """Return the numbers of each group of a peer type: one value, or one per peer, or an expression.
+
+    An expression is used for a number that depends on a number with one value per peer.
+    """
     common = {f"{part.name}.{name}": value for part in topology.parts for name, value in part.values}
     result = []
     for group in (group for group in topology.groups if group.name in peer_type.flat.groups):
@@ -120,7 +133,8 @@ def _numbers(topology: Topology, peer_type: ClockedPeerType) -> list[dict[Symbol
         numbers: dict[str, Given] = {"peers": Fraction(topology.peers)}
         for name, value in (common | dict(group.values)).items():
             numbers[name] = value.number
-            # Inside a part, what depends on a number that differs from peer to peer does so too.
+            # A number inside a part that depends on a number with one value per peer has one value per peer
+            # too.
             used = () if value.expression is None else map(format_expression, names(value.expression))
             if value.expression is not None and not varying.keys().isdisjoint(used):
                 varying.setdefault(name, to_term(value.expression))
@@ -128,10 +142,15 @@ def _numbers(topology: Topology, peer_type: ClockedPeerType) -> list[dict[Symbol
     return result
 
 
-def _sorted(peer_type: ClockedPeerType, divisors: Divisors, mistakes: Mistakes) -> SortedPeerType:
-    """Sort and solve a peer type. Raises ApcError with the errors of the continuous equations."""
+def _sorted_peer_type(peer_type: ClockedPeerType, divisors: Divisors, mistakes: Mistakes) -> SortedPeerType:
+    """Return the explicit equations of a peer type.
+
+    Raises ApcError with the errors of the continuous equations; the errors of clocked equations are added to
+    `mistakes`.
+    """
 
     def problem(where: str, part: Partition) -> Problem:
+        """Return the context of the equations of one partition, named `where` in messages."""
         location = next(
             (equation.location for equation in (*part.equations, *peer_type.flat.equations)),
             SourceLocation("topology"),
@@ -147,10 +166,10 @@ def _sorted(peer_type: ClockedPeerType, divisors: Divisors, mistakes: Mistakes) 
     for part in peer_type.partitions[1:]:
         clock_problem = problem(f"the equations of clock {part.clock}", part)
         with mistakes:
-            equal = zip(part.equations, _sides(part.equations, None, clock_problem), strict=True)
+            equation_sides = zip(part.equations, _sides(part.equations, None, clock_problem), strict=True)
             residuals = [
                 Residual((left - right).xreplace(reductions), flat_equation)
-                for flat_equation, (left, right) in equal
+                for flat_equation, (left, right) in equation_sides
             ]
             steps = solve_blocks(residuals, [symbol(name) for name in part.variables], clock_problem)
             partitions.append(SortedPartition(part.clock, steps))
@@ -176,58 +195,98 @@ def _sorted(peer_type: ClockedPeerType, divisors: Divisors, mistakes: Mistakes) 
 def _sorted_continuous(
     peer_type: ClockedPeerType, problem: Problem
 ) -> tuple[tuple[str, ...], tuple[Assignment, ...], tuple[Step, ...], list[Term]]:
-    """Return states, aliases, steps, sampled and sent values. Raises ApcError if impossible."""
+    """Return the equations of the continuous partition in the order in which they can be computed.
+
+    Returns
+    -------
+    tuple of str
+        The states.
+    tuple of Assignment
+        The eliminated variables, each as a term in the retained ones.
+    tuple of Step
+        The steps that compute the derivatives of the states and the other unknowns.
+    list of Term
+        The sampled values, then the sent values.
+
+    Raises
+    ------
+    ApcError
+        The equations cannot be solved.
+    """
     variables, equations = peer_type.partitions[0].variables, peer_type.partitions[0].equations
     started = {variable.name for variable in peer_type.flat.variables if variable.start}
-    moving = DifferentiatedNames(dict.fromkeys(variables), {hold.symbol for hold in peer_type.holds})
-    # What is read, each as an equation of its own, `sample(x) = x`, for messages.
+    time_varying = DifferentiatedNames(dict.fromkeys(variables), {hold.symbol for hold in peer_type.holds})
+    # Sampled and sent values, each as an equation `sample(x) = x`, for messages.
     where = problem.location
-    reads = [
+    read_equations = [
         FlatEquation(Name((s.symbol,)), s.expression, s.clock, s.clock, where) for s in peer_type.samples
     ]
-    reads += [
+    read_equations += [
         FlatEquation(Name((s.name,)), s.expression, s.link, None, s.location) for s in peer_type.flat.sends
     ]
-    sides = _sides((*equations, *reads), moving.differentiate, problem)
-    aliases = Aliases(moving, started)
+    sides = _sides((*equations, *read_equations), time_varying.differentiate, problem)
+    aliases = Aliases(time_varying, started)
     residuals = aliases.remove(
         [Residual(left - right, equation) for equation, (left, right) in zip(equations, sides, strict=False)]
     )
-    values = zip(reads, sides[len(equations) :], strict=True)
-    read = [Residual(aliases.substitute(value), flat_equation) for flat_equation, (_, value) in values]
-    if none := [residual for residual in (*residuals, *read) if is_no_number(residual.expression)]:
-        raise problem.no_number(none)
-    # A derivative that has a name of its own, or that is read, is asked for, even if no equation holds it.
-    requested = [
-        *aliases.velocities,
-        *(it for residual in read for it in moving.derivatives(residual.expression).values()),
+    values = zip(read_equations, sides[len(equations) :], strict=True)
+    read_residuals = [
+        Residual(aliases.substitute(value), flat_equation) for flat_equation, (_, value) in values
+    ]
+    if invalid := [
+        residual for residual in (*residuals, *read_residuals) if is_no_number(residual.expression)
+    ]:
+        raise problem.no_number(invalid)
+    # A derivative with a variable name, or one that is sampled or sent, is required even if no equation has
+    # it.
+    required = [
+        *aliases.named_derivatives,
+        *(
+            required_derivative
+            for residual in read_residuals
+            for required_derivative in time_varying.derivatives(residual.expression).values()
+        ),
     ]
     orders = {name: 0 for name in variables if name not in aliases.replacements} | dict(
-        sorted(requested, key=itemgetter(1))
+        sorted(required, key=itemgetter(1))
     )
-    reduction = IndexReduction(residuals, orders, moving, problem)
+    reduction = IndexReduction(residuals, orders, time_varying, problem)
     solving, unknowns, differentiated = reduction.reduced({*map(aliases.value, started)})
     states = tuple(aliases.shown(s).name for s in differentiated)
     for state in (state for state in states if state not in started):
         holder = next((equation for equation in equations if f"der({state})" in equation.text), equations[0])
-        message = f"{state} is a state, by `{holder.text}` ({holder.origin}), and has no start value"
-        hint = f"{state.rpartition('.')[2]}: {{…, start: …}}"
+        message = f"the state {state} (by `{holder.text}` of {holder.origin}) has no start value"
+        advice = f"write start: at {state.rpartition('.')[2]}"
         if state.startswith("der("):
-            hint = f"{state} = v, with a start value for v"
-        problem.mistakes.add("E510", holder.location, message, hint=hint)
+            advice = f"write {state} = v, and start: at v"
+        problem.mistakes.add("E510", holder.location, message, advice=advice)
     shown = [Residual(aliases.shown(residual.expression), residual.equation) for residual in solving]
     steps = solve_blocks(shown, [aliases.shown(s) for s in unknowns], problem)
-    below = {v: aliases.shown(derivative(x, order - 1)).name for (x, order), v in aliases.velocities.items()}
-    rates = [(f"der({x})", symbol(v)) for v, x in below.items() if x in states]
-    pairs = [rate for rate in rates if rate[1].name in states]
-    steps = (*pairs, *steps, *(rate for rate in rates if rate not in pairs))
-    return states, aliases.assignments(), steps, [aliases.shown(residual.expression) for residual in read]
+    # The derivative of a state with a variable name has the value of this variable: known at first if it is a
+    # state, else after the step that computes it.
+    integrals = {
+        alias: aliases.shown(derivative(x, order - 1)).name
+        for (x, order), alias in aliases.named_derivatives.items()
+    }
+    rates = [(f"der({x})", symbol(alias)) for alias, x in integrals.items() if x in states]
+    state_rates = [rate for rate in rates if rate[1].name in states]
+    steps = (*state_rates, *steps, *(rate for rate in rates if rate not in state_rates))
+    return (
+        states,
+        aliases.assignments(),
+        steps,
+        [aliases.shown(residual.expression) for residual in read_residuals],
+    )
 
 
 def _sides(
     equations: Sequence[FlatEquation], differentiate: Callable[[Term], Term] | None, problem: Problem
 ) -> list[tuple[Term, Term]]:
-    """Return both sides of equations. Raises ApcError for derivatives and constants that do not exist."""
+    """Return both sides of each equation as terms.
+
+    `differentiate` returns the time derivative of a term, None if `der` cannot occur. Raises errors for
+    derivatives and constants that do not exist.
+    """
     pairs = []
     for equation in equations:
         with problem.mistakes:

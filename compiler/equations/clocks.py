@@ -6,23 +6,26 @@ Guarantees: each variable is continuous or belongs to one clock, and so does eac
 the missing crossing; each crossing has its clock.
 Does not: solve or sort anything.
 
-Modelica's clock partitioning (Modelica Language Specification 3.6, section 16.7) does the same: variables of
-one equation are merged into sets, which samples, holds, `der` and a part's clock pin down.
+The method is Modelica's clock partitioning (Modelica Language Specification 3.6, section 16.7): variables of
+one equation are merged into sets, whose clock is determined by samples, holds, `der` and the clock of a part.
 
 Event order. Periods, phases and delays are exact rationals of a second. At an instant t:
 
-1. continuous variables are sampled: their value at t⁻, before anything below happens;
-2. network clocks tick: each sender's packet takes the sample at t, and packets with an arrival time ≤ t are
+1. continuous variables are sampled: their value at t⁻, before steps 2 to 4;
+2. network clocks tick: each sender's packet contains the sample at t, and packets with an arrival time ≤ t
+are
    delivered;
 3. force clocks tick: forces are computed from the samples at t and the newest delivered values;
-4. holds switch: a force computed at t acts from t + its delay (0 means t⁺) until the next one acts.
+4. holds switch: a force computed at t acts from t + its delay (0 means t⁺) until the next force acts.
 
-A link's delay T_d means: sent at t, available from t + T_d on; a tick at exactly t + T_d sees it. Before the
-first packet arrives a receiver holds the sender's start values; before the first force acts it is zero.
+For a link's delay T_d, a packet sent at t is available from t + T_d on, including a tick at exactly t + T_d.
+Before the first packet arrives, a receiver uses the sender's start values; before the first force acts, the
+force is zero.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
@@ -42,6 +45,7 @@ from apc.compiler.equations.flatten import (
 )
 from apc.compiler.errors import Mistakes, SourceLocation
 from apc.compiler.language.expression import Call, Expr, Name, format_expression, names, transform, walk
+from apc.compiler.language.unit_text import format_dimension
 from apc.compiler.topology.topology import Topology
 
 CONTINUOUS = "continuous"
@@ -58,7 +62,11 @@ class Partition:
 
 @dataclass(frozen=True, slots=True)
 class ClockedPeerType:
-    """A peer type, partitioned. `partitions` starts with the continuous one."""
+    """A peer type, partitioned by clock.
+
+    `partitions` begins with the continuous partition. `samples`, `holds`, `previous` and `receives` are the
+    conversions between partitions, and between peers.
+    """
 
     flat: FlatPeerType
     partitions: tuple[Partition, ...]
@@ -70,14 +78,17 @@ class ClockedPeerType:
 
 @dataclass(frozen=True, slots=True)
 class ClockedSystem:
-    """The topology, partitioned."""
+    """The topology with the partitioned peer types."""
 
     topology: Topology
     peer_types: tuple[ClockedPeerType, ...]
 
 
 def partition(flat: FlatSystem) -> ClockedSystem:
-    """Give every variable its clock. Raises ApcError with every crossing that isn't said."""
+    """Return the peer types with the clock of every variable and equation.
+
+    Raises ApcError with all missing crossings between clocks.
+    """
     mistakes = Mistakes(flat.topology.names)
     peer_types = tuple(_partitioned(peer_type, mistakes) for peer_type in flat.peer_types)
     mistakes.raise_if_any()
@@ -85,7 +96,7 @@ def partition(flat: FlatSystem) -> ClockedSystem:
 
 
 def check_single(component: Component, location: SourceLocation, mistakes: Mistakes) -> None:
-    """Record errors of a component's clocks that occur in every topology."""
+    """Record errors of a component's clocks that are independent of a topology."""
     flat = flatten_single(component, location, mistakes)
     if mistakes:
         return
@@ -93,11 +104,12 @@ def check_single(component: Component, location: SourceLocation, mistakes: Mista
     for name, connector in component.connectors:
         for potential, flow in zip(connector.potentials, connector.flows, strict=True):
             text, other = (f"{component.name}.{name}.{variables.name}" for variables in (potential, flow))
-            if clocks.pinned(text) == CONTINUOUS != clocks.of(other) and other in clocks.given:
+            if clocks.known_clock(text) == CONTINUOUS != clocks.of(other) and other in clocks.given:
                 clocks.report_flow(other, clocks.given[other])
 
 
 def _partitioned(peer_type: FlatPeerType, mistakes: Mistakes) -> ClockedPeerType:
+    """Return a peer type with the partition of each clock, and the clock of each crossing."""
     clocks = _Clocks(peer_type, mistakes)
     crossings = [
         crossing
@@ -111,13 +123,17 @@ def _partitioned(peer_type: FlatPeerType, mistakes: Mistakes) -> ClockedPeerType
     receives = tuple(crossing for crossing in crossings if isinstance(crossing, ReceiveCrossing))
     for hold in holds:
         if hold.clock == CONTINUOUS:
-            call = format_expression(Call("hold", (Name((hold.shown,)), hold.delay)))
-            message = f"{call} holds {hold.shown}, which is continuous already"
-            if (given := clocks.given.get(hold.shown)) and (hint := _sampled(given)):
-                message = f"{call} acts from a tick on, so that {hold.shown} samples what moves"
-                mistakes.add("E505", given.location, message, hint=hint)
+            holding = [one for one in peer_type.equations if one.location == hold.location]
+            # Parts of one component have equations at the same location.
+            texts = (_local(hold.shown, equation) for equation in holding)
+            held = next((text for text in texts if text != hold.shown), hold.shown)
+            if (given := clocks.given.get(hold.shown)) and (fix := _sampled_text(given)):
+                message = f"hold({held}): {held} must be sampled at a clock"
+                mistakes.add("E505", given.location, message, fix=fix)
             else:
-                mistakes.add("E505", hold.location, message, hint=hold.shown)
+                message = f"hold({held}): {held} is already continuous"
+                fix = next((_unheld_text(equation, held) for equation in holding), "")
+                mistakes.add("E505", hold.location, message, fix=fix)
     for previous_crossing in previous:
         if previous_crossing.clock == CONTINUOUS:
             mistakes.add(
@@ -130,67 +146,97 @@ def _partitioned(peer_type: FlatPeerType, mistakes: Mistakes) -> ClockedPeerType
         for variable in map(format_expression, names(send.expression)):
             clocks.check_start(variable, send.location)
             if variable in clocks.variables and (clock := clocks.of(variable)) != CONTINUOUS:
-                message = f"{send.name} is sent at ticks of {send.link}, and {variable} is on clock {clock}"
+                message = f"{send.name} is sent at ticks of {send.link}, but {variable} is on clock {clock}"
                 shown = variable.removeprefix(f"{send.name.rpartition('.')[0]}.")
-                mistakes.add("E505", send.location, message, hint=f"sample(hold({shown}))")
+                mistakes.add("E505", send.location, message, fix=f"sample(hold({shown}))")
     members: dict[str, tuple[list[str], list[FlatEquation]]] = {CONTINUOUS: ([], [])}
     for index, equation in enumerate(peer_type.equations):
         members.setdefault(clocks.of(f"equation {index}"), ([], []))[1].append(equation)
     for variable in clocks.variables:
         members.setdefault(clocks.of(variable), ([], []))[0].append(variable)
     partitions = tuple(
-        Partition(clock, tuple(variables), tuple(of)) for clock, (variables, of) in members.items()
+        Partition(clock, tuple(variables), tuple(equations))
+        for clock, (variables, equations) in members.items()
     )
     return ClockedPeerType(peer_type, partitions, samples, holds, previous, receives)
 
 
-# Operators beneath which nothing is sampled once more.
+# Operators whose arguments need no further sample.
 CROSSING = ("sample", "hold", "previous", "mean", "sum", "max", "min")
 
 
 def _leaves(equation: FlatEquation) -> Iterator[Name]:
-    """Yield the names in an equation."""
+    """Yield the names on both sides of an equation."""
     for side in (equation.left, equation.right):
         yield from names(side)
 
 
-def _sampled(equation: FlatEquation) -> str:
-    """Return a part's equation with all that is continuous at its connectors sampled, "" where nothing is."""
+def _sampled_text(equation: FlatEquation) -> str:
+    """Return the text of a part's equation with its connectors' variables sampled; empty if there is none."""
     written = equation.written
     if written is None or equation.clock is None:
         return ""
 
     def sample(node: Expr) -> Expr | None:
+        """Return the sample of a variable of a connector or its derivative, or None if a node remains."""
         if isinstance(node, Call) and node.function in CROSSING:
             return node
-        of = node.arguments[0] if isinstance(node, Call) and node.function == "der" else node
-        return Call("sample", (node,)) if isinstance(of, Name) and len(of.parts) > 1 else None
+        variable = node.arguments[0] if isinstance(node, Call) and node.function == "der" else node
+        return Call("sample", (node,)) if isinstance(variable, Name) and len(variable.parts) > 1 else None
 
     right = transform(written.right, sample)
-    same = right is written.right
-    return "" if same else f"{format_expression(written.left)} = {format_expression(right)}"
+    unchanged = right is written.right
+    return "" if unchanged else f"{format_expression(written.left)} = {format_expression(right)}"
+
+
+def _local(text: str, equation: FlatEquation) -> str:
+    """Return a text with the names of a part as in its component: `contact.a.f` as `a.f`."""
+    return re.sub(rf"(?<![\w.])(others\.)?{re.escape(equation.origin)}\.", r"\1", text)
+
+
+def _unheld_text(equation: FlatEquation, held: str) -> str:
+    """Return the text of a part's equation without the hold of `held`; empty if there is none."""
+    written = equation.written
+    if written is None:
+        return ""
+
+    def argument(node: Expr) -> Expr | None:
+        """Return the argument of the hold, or None if a node remains."""
+        if isinstance(node, Call) and node.function == "hold":
+            return node.arguments[0] if format_expression(node.arguments[0]) == held else None
+        return None
+
+    right = transform(written.right, argument)
+    unchanged = right is written.right
+    return "" if unchanged else f"{format_expression(written.left)} = {format_expression(right)}"
 
 
 class _Clocks:
     """The clock of each variable and equation of a peer type, by sets of names with a common clock.
 
-    A clock is a member of its set, by its own name. `given` are the parts' equations, by the name on their
-    left side; `variables` are those with a start value.
+    The name of a clock is a member of its set. `given` are the parts' equations, by the name on the left
+    side; `variables` has each variable, and whether it has a start value.
     """
 
     def __init__(self, peer_type: FlatPeerType, mistakes: Mistakes) -> None:
+        """Merge the names of each equation, and record errors for parts without a clock."""
         self.mistakes = mistakes
         self.variables = {variable.name: variable.start for variable in peer_type.variables}
+        self._dimensions = {variable.name: variable.dimension for variable in peer_type.variables}
         self.given: dict[str, FlatEquation] = {}
         self._crossings = {crossing.symbol: crossing for crossing in peer_type.crossings}
         self._sets = DisjointSet()
-        crossed = (crossing.clock for crossing in peer_type.crossings if isinstance(crossing, SampleCrossing))
-        named = {
+        sample_clocks = (
+            crossing.clock for crossing in peer_type.crossings if isinstance(crossing, SampleCrossing)
+        )
+        clock_names = {
             CONTINUOUS,
-            *crossed,
+            *sample_clocks,
             *(equation.clock for equation in peer_type.equations if equation.clock is not None),
         }
-        self._clocks = {clock: clock for clock in named}  # of each set that has one, by its root
+        self._clocks = {
+            clock: clock for clock in clock_names
+        }  # the clock of each set that has one, by the root of the set
         self._reported: set[str] = set()  # parts whose clocked flow was reported
         receiving: dict[str, FlatEquation] = {}
         for index, equation in enumerate(peer_type.equations):
@@ -200,101 +246,123 @@ class _Clocks:
                 self._visit(side, f"equation {index}", equation, receiving)
         for name, equation in receiving.items():
             if self.of(name) == CONTINUOUS:
-                message = f"{equation.origin} hears the other peers but has no parameter that names one clock"
-                mistakes.add("E504", equation.location, message, hint="parameters: {clock: clock}")
+                message = f"{equation.origin} receives from other peers but has no clock parameter"
+                mistakes.add("E504", equation.location, message, advice="add clock: clock to its parameters")
 
     def of(self, name: str) -> str:
-        """Return the clock of a variable or equation; continuous where nothing asks for a clock."""
-        return self.pinned(name) or CONTINUOUS
+        """Return the clock of a variable or equation; continuous if no clock is determined."""
+        return self.known_clock(name) or CONTINUOUS
 
-    def pinned(self, name: str) -> str:
-        """Return the clock that something asks for, empty if nothing does."""
+    def known_clock(self, name: str) -> str:
+        """Return the clock of a name, empty if no clock is determined."""
         return self._clocks.get(self._root(name), "")
 
     def check_start(self, name: str, location: SourceLocation) -> None:
-        """Record the error E507 if a name such as `initial(x)` or `previous(x)` has no start value."""
+        """Record the error E507 for `initial(x)` or `previous(x)` of a variable x without a start value."""
         call, _, variable = name[:-1].partition("(")
         if call in ("initial", "previous") and not self.variables.get(variable, True):
-            hint = f"variables: {{{variable.rpartition('.')[2]}: {{unit: …, start: 0}}}}"
-            self.mistakes.add("E507", location, f"{name} needs a start value of {variable}", hint=hint)
+            unit = format_dimension(self._dimensions[variable])
+            fix = f"{variable.rpartition('.')[2]}: {{unit: {unit}, start: 0}}"
+            self.mistakes.add("E507", location, f"{name} needs a start value of {variable}", fix=fix)
 
     def _root(self, name: str) -> str:
+        """Return the representative name of the set of a name."""
         self._sets.add(name)
         return str(self._sets[name])
 
     def _visit(
         self, expression: Expr, domain: str, equation: FlatEquation, receiving: dict[str, FlatEquation]
     ) -> None:
-        """Merge the names in an expression with its domain: its equation, or the argument of a sample."""
+        """Merge the names in an expression with its domain.
+
+        Parameters
+        ----------
+        expression, domain
+            The expression, and its domain: the name of the equation, or of the argument of a sample.
+        equation
+            The equation that contains the expression.
+        receiving
+            By domain, the equations of parts without a clock that receive values of other peers; added to.
+        """
         for node in walk(expression):
             if isinstance(node, Call) and node.function == "der":
-                self._join(domain, CONTINUOUS, format_expression(node), equation)
+                self._merge(domain, CONTINUOUS, format_expression(node), equation)
             if not isinstance(node, Name):
                 continue
             name = ".".join(node.parts)
             self.check_start(name, equation.location)
             crossing = self._crossings.get(name)
             if name in self.variables:
-                self._join(domain, name, name, equation)
+                self._merge(domain, name, name, equation)
             if isinstance(crossing, PreviousCrossing | ReceiveCrossing) and equation.clock is not None:
-                self._join(domain, equation.clock, name, equation)
+                self._merge(domain, equation.clock, name, equation)
             match crossing:
                 case SampleCrossing():
-                    self._join(domain, crossing.clock, name, equation)
+                    self._merge(domain, crossing.clock, name, equation)
                     inside = f"inside {name} of {equation.origin}"
-                    self._join(inside, CONTINUOUS, name, equation)
+                    self._merge(inside, CONTINUOUS, name, equation)
                     self._visit(crossing.expression, inside, equation, receiving)
                 case HoldCrossing():
-                    self._join(domain, CONTINUOUS, name, equation)
+                    self._merge(domain, CONTINUOUS, name, equation)
                 case PreviousCrossing():
-                    self._join(domain, crossing.variable, crossing.variable, equation)
+                    self._merge(domain, crossing.variable, crossing.variable, equation)
                 case ReceiveCrossing():
                     self._visit(crossing.argument, domain, equation, receiving)
-                    self._join(domain, name, name, equation)
+                    self._merge(domain, name, name, equation)
                     if equation.clock is None:
                         receiving.setdefault(domain, equation)
 
-    def _join(self, domain: str, name: str, shown: str, equation: FlatEquation) -> None:
-        """Merge the sets of a domain and of a name in it, unless they have different clocks."""
-        clock, other = self.pinned(domain), self.pinned(name)
-        if clock and other and clock != other:
-            self._report(shown, other, clock, equation)
-        elif self._sets.merge(self._root(domain), self._root(name)) and (clock or other):
-            self._clocks[self._root(name)] = clock or other
+    def _merge(self, domain: str, name: str, shown: str, equation: FlatEquation) -> None:
+        """Merge the sets of a domain and of a name; record an error if they have different clocks.
 
-    def _report(self, name: str, clock: str, others: str, equation: FlatEquation) -> None:
-        if equation.origin == CONNECTION and others == CONTINUOUS and name in self.given:
+        `shown` is the name as in `equation`, for the message.
+        """
+        domain_clock, name_clock = self.known_clock(domain), self.known_clock(name)
+        if domain_clock and name_clock and domain_clock != name_clock:
+            self._report(shown, name_clock, domain_clock, equation)
+        elif self._sets.merge(self._root(domain), self._root(name)) and (domain_clock or name_clock):
+            self._clocks[self._root(name)] = domain_clock or name_clock
+
+    def _report(self, name: str, clock: str, other_clock: str, equation: FlatEquation) -> None:
+        """Record the error E505: a name and the other names of its equation are on different clocks.
+
+        The location is the part's equation in which a sample or hold is missing. `clock` is that of the name,
+        `other_clock` that of the other names.
+        """
+        if equation.origin == CONNECTION and other_clock == CONTINUOUS and name in self.given:
             self.report_flow(name, self.given[name])
             return
         if equation.origin == CONNECTION:  # of the unsampled names in a part's equation
             sides = {format_expression(side) for side in (equation.left, equation.right)}
-            taking = [
-                equation
-                for equation in self.given.values()
-                if sides & set(map(format_expression, _leaves(equation)))
+            candidates = [
+                given for given in self.given.values() if sides & set(map(format_expression, _leaves(given)))
             ]
         else:
-            taking = [equation] if clock == CONTINUOUS else []
-        for other in taking if CONTINUOUS in (clock, others) else ():
-            if hint := _sampled(other):
+            candidates = [equation] if clock == CONTINUOUS else []
+        for other in candidates if CONTINUOUS in (clock, other_clock) else ():
+            if fix := _sampled_text(other):
                 message = (
-                    f"`{other.text}` of {other.origin} is on clock {other.clock}, and samples what moves"
+                    f"`{other.text}` of {other.origin} is on clock {other.clock} and needs sample() for "
+                    "continuous values"
                 )
-                self.mistakes.add("E505", other.location, message, hint=hint)
+                self.mistakes.add("E505", other.location, message, fix=fix)
                 return
-        hint = f"one clock for both, or sample(hold({name}))"
-        if CONTINUOUS in (clock, others):
-            hint = f"sample({name})" if clock == CONTINUOUS else f"hold({name})"
-        words = [CONTINUOUS if text == CONTINUOUS else f"on clock {text}" for text in (clock, others)]
+        fix, advice = f"sample(hold({name}))", "use one clock for both"
+        if CONTINUOUS in (clock, other_clock):
+            advice = ""
+            operator = "sample" if clock == CONTINUOUS else "hold"
+            fix = f"{operator}({_local(name, equation)})"
+        words = [CONTINUOUS if text == CONTINUOUS else f"on clock {text}" for text in (clock, other_clock)]
         message = (
-            f"in `{equation.text}` of {equation.origin}, {name} is {words[0]} and the rest is {words[1]}"
+            f"in `{equation.text}` of {equation.origin}, {name} is {words[0]} but the other terms are "
+            f"{words[1]}"
         )
-        self.mistakes.add("E505", equation.location, message, hint=hint)
+        self.mistakes.add("E505", equation.location, message, fix=fix, advice=advice)
 
     def report_flow(self, name: str, given: FlatEquation) -> None:
-        """Report a part's clocked flow at its equation, with a hold as the fix."""
+        """Record the error E505 for a part's clocked flow, once per part, with a hold as the fix."""
         if given.origin not in self._reported and given.written is not None:
             self._reported.add(given.origin)
             left, right = format_expression(given.written.left), format_expression(given.written.right)
-            message = f"{name} acts on what it is joined to at all times, and is on clock {self.of(name)}"
-            self.mistakes.add("E505", given.location, message, hint=f"{left} = hold({right})")
+            message = f"{name} is a continuous connector variable, but its value is on clock {self.of(name)}"
+            self.mistakes.add("E505", given.location, message, fix=f"{left} = hold({right})")

@@ -1,9 +1,9 @@
-"""Connectors that meet, and the equations of their meeting.
+"""Connected connectors and their connection equations.
 
 Takes: the parts of one peer type. Gives: `connection_equations`.
-Guarantees: potentials that meet are equal, flows that meet sum to zero; at the ground potentials are zero and
-flows whatever they must be.
-Does not: write out the parts' own equations (see `flatten`).
+Guarantees: connected potentials are equal, connected flows sum to zero; at the ground potentials are zero and
+flows are unconstrained.
+Does not: expand the parts' own equations (see `flatten`).
 """
 
 from __future__ import annotations
@@ -23,54 +23,57 @@ ZERO = NumberLiteral(Fraction(0))
 def connection_equations(
     parts: Sequence[PartInstance], mistakes: Mistakes
 ) -> Iterator[tuple[Expr, Expr, SourceLocation]]:
-    """Yield the equations (left, right, place) of each set of connected connectors.
+    """Yield the equations (left, right, location) of each set of connected connectors.
 
-    Each set is ordered outwards: a mass's connector comes before those connected to it. The ground joins
-    nothing: each set has its own.
+    In each set the connector of a mass comes before the connectors connected to it. Connections to the ground
+    are separate sets: the ground connects nothing. A connection to a part that the peer does not have is
+    recorded.
     """
     by_name = {part.name: part for part in parts}
-    connectors = {(part.name, local): type_ for part in parts for local, type_ in part.component.connectors}
-    meeting = {terminal: [terminal] for terminal in connectors}
+    connectors = {(part.name, name): type_ for part in parts for name, type_ in part.component.connectors}
+    set_of = {terminal: [terminal] for terminal in connectors}
 
-    def join(pair: Terminal, other: Terminal) -> None:
-        joining, joined = meeting[pair], meeting[other]
-        if joining is not joined:
-            joined.extend(joining)
-            meeting.update(dict.fromkeys(joining, joined))
+    def merge(terminal: Terminal, other: Terminal) -> None:
+        """Merge the sets of two connectors."""
+        moved, merged = set_of[terminal], set_of[other]
+        if moved is not merged:
+            merged.extend(moved)
+            set_of.update(dict.fromkeys(moved, merged))
 
     passed, grounded = set(), set()
     for part in parts:
-        for connector, inner, connector_of_other in part.component.passed:
+        for connector, inner, other_connector in part.component.passed:
             passed.add((part.name, connector))
-            join((part.name, connector), (f"{part.name}.{inner}", connector_of_other))
+            merge((part.name, connector), (f"{part.name}.{inner}", other_connector))
     for part in parts:
-        for connector, other, connector_of_other in part.connections:
+        for connector, other, other_connector in part.connections:
             if other == GROUND:
                 grounded.add((part.name, connector))
             elif other in by_name:
-                join((part.name, connector), (other, connector_of_other))
+                merge((part.name, connector), (other, other_connector))
             else:
-                message = f"{part.name} is at groups where {other}, which it joins, is not"
-                hint = f"at: the same groups at both {part.name} and {other}"
-                mistakes.add("E210", part.location, message, hint=hint)
-    for members in {id(members): members for members in meeting.values()}.values():
-        joined = [terminal for terminal in members if terminal not in passed]
-        location, type_ = by_name[joined[-1][0]].location, connectors[joined[0]]
+                message = f"{part.name} is connected to {other}, but a group with {part.name} has no {other}"
+                advice = f"use the same groups in at: of {part.name} and {other}"
+                mistakes.add("E210", part.location, message, advice=advice)
+    for members in {id(members): members for members in set_of.values()}.values():
+        terminals = [terminal for terminal in members if terminal not in passed]
+        location, type_ = by_name[terminals[-1][0]].location, connectors[terminals[0]]
         is_free = grounded.isdisjoint(members)
         for potential in type_.potentials:
-            terms = [_name(terminal, potential.name) for terminal in joined]
+            terms = [_name(terminal, potential.name) for terminal in terminals]
             yield from ((name, terms[0] if is_free else ZERO, location) for name in terms[is_free:])
         for flow in type_.flows if is_free else ():
-            yield _sum([_name(terminal, flow.name) for terminal in joined]), ZERO, location
+            yield _sum([_name(terminal, flow.name) for terminal in terminals]), ZERO, location
 
 
 def _name(terminal: Terminal, variable: str) -> Name:
+    """Return the name of a variable of a connector in the expression of a peer type."""
     return Name((*terminal[0].split("."), terminal[1], variable))
 
 
 def _sum(terms: Sequence[Expr]) -> Expr:
-    """Return a sum as a tree of little depth, so that a thousand parts may meet at one flange."""
+    """Return a sum as a balanced tree, so that a thousand parts can be connected at one connector."""
     if len(terms) == 1:
         return terms[0]
-    half = len(terms) // 2 if len(terms) > 16 else -1  # few read best as they are written
+    half = len(terms) // 2 if len(terms) > 16 else -1  # short sums keep their order
     return Call("+", (_sum(terms[:half]), _sum(terms[half:])))

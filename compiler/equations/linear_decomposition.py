@@ -1,11 +1,12 @@
-"""Reductions over the other peers, with linear ones split into terms.
+"""Reductions over the other peers; a linear reduction is split into reductions of single values.
 
 Takes: `ReceiveCrossing`s. Gives: `PeerReduction`, `linear_decomposition`.
 Guarantees: the term has the value of the original reduction.
-Does not: use the number of others: it is a parameter of the subsystem.
+Does not: use the number of other peers: it is a parameter of the subsystem.
 
 Received values are others.k, previous(others.k), the age of the packet, or age times others.k. A mean or sum
-that is linear in these is a combination of the means or sums of each, so that N peers cost N, not N².
+that is linear in received values is a linear combination of their means or sums, so that the cost for N peers
+is proportional to N, not N².
 """
 
 from __future__ import annotations
@@ -30,10 +31,10 @@ TEXTS = {"": "others.{0}", "factor": "age(others.{0})*others.{0}", "alone": "age
 
 @dataclass(frozen=True, slots=True)
 class PeerReduction:
-    """`symbol` represents, at a tick, the `operator` over the peers received over `link`.
+    """The reduction `operator` over the peers received over `link`; its value at a tick is `symbol`.
 
-    Without an `edge` its operands are the values sent as `send`, with `age` and `before` as in
-    `compiled.Receive`; with one, the values of `edge` for each peer.
+    Without `edge` its operands are the values sent as `send`, with `age` and `before` as in
+    `compiled.Receive`; with `edge`, the values of this term for each peer.
     """
 
     symbol: str
@@ -48,25 +49,37 @@ class PeerReduction:
 
     @property
     def sends(self) -> list[str]:
-        """The names of received values."""
+        """The names of the received values."""
         symbols = () if self.edge is None else self.edge.free_symbols - {AGE}
         others = sorted(s.name.removeprefix(f"{OTHERS}.") for s in symbols if s.name.startswith(f"{OTHERS}."))
         return list(dict.fromkeys([self.send, *others]))
 
 
 def linear_decomposition(crossing: ReceiveCrossing, mistakes: Mistakes) -> tuple[Term, list[PeerReduction]]:
-    """Return a reduction as a term, with its received values; with an edge if it is not linear.
+    """Return the value of a reduction as a term, and the reductions of single received values in the term.
+
+    A reduction that is not linear in the received values is returned with an edge term.
 
     Parameters
     ----------
     crossing
         The reduction.
     mistakes
-        Collects E506 a value required for each peer that is available only as an aggregate.
+        The collector of errors: E506 if the previous value of each peer is required, of which only means and
+        sums exist.
+
+    Returns
+    -------
+    Term
+        The value, in symbols of the single reductions.
+    list of PeerReduction
+        The single reductions.
     """
     operator, link = crossing.operator, crossing.link
     count = symbol(count_of(link))
-    values: dict[Symbol, tuple[str, bool]] = {}  # what others send: its name, and whether of the tick before
+    values: dict[
+        Symbol, tuple[str, bool]
+    ] = {}  # received values: the name, and whether it is the value of the previous tick
     ages: dict[Symbol, str] = {}
     for name in map(format_expression, names(crossing.argument)):
         if match := RECEIVED.fullmatch(name):
@@ -76,43 +89,48 @@ def linear_decomposition(crossing: ReceiveCrossing, mistakes: Mistakes) -> tuple
             else:
                 values[symbol(name)] = send, call == "previous"
     term = to_term(crossing.argument).xreplace(dict.fromkeys(ages, AGE))
-    first = next(iter((*ages.values(), *(send for send, _ in values.values()))), "")
-    whole = PeerReduction(crossing.symbol, operator, first, link, crossing.clock, crossing.location)
-    parts = _linear_parts(term, values.keys()) if operator in ("mean", "sum") else None
-    if parts is None or any(aged and value in values and values[value][1] for value, aged in parts):
-        for earlier in (send for send, before in values.values() if before):
-            previous = f"previous(others.{earlier.rpartition('.')[2]})"
-            hint, expected = f"mean({previous}), or sum", "a mean or sum that is linear in it"
-            mistakes.add("E506", crossing.location, previous, expected=expected, hint=hint)
+    any_send = next(iter((*ages.values(), *(send for send, _ in values.values()))), "")
+    reduction = PeerReduction(crossing.symbol, operator, any_send, link, crossing.clock, crossing.location)
+    linear_parts = _linear_parts(term, values.keys()) if operator in ("mean", "sum") else None
+    if linear_parts is None or any(
+        aged and value in values and values[value][1] for value, aged in linear_parts
+    ):
+        for previous_send in (send for send, before in values.values() if before):
+            previous = f"previous(others.{previous_send.rpartition('.')[2]})"
+            fix, expected = f"mean({previous}), or sum", "a mean or sum that is linear in it"
+            mistakes.add("E506", crossing.location, previous, expected=expected, fix=fix)
         if term not in values:
-            whole = replace(whole, edge=term, age="edge" if AGE in term.free_symbols else "")
-        if operator == "sum" and whole.age and values.keys().isdisjoint(term.free_symbols):
-            whole = replace(whole, symbol=f"mean{whole.symbol.removeprefix(operator)}", operator="mean")
-        return symbol(whole.symbol) * (1 if whole.operator == operator else count), [whole]
-    total, received = ZERO, list[PeerReduction]()
-    for (value, aged), coefficient in parts.items():
-        send, before = values.get(value, (first, False))
-        many = count if operator == "sum" and value is None else 1
+            reduction = replace(reduction, edge=term, age="edge" if AGE in term.free_symbols else "")
+        if operator == "sum" and reduction.age and values.keys().isdisjoint(term.free_symbols):
+            reduction = replace(
+                reduction, symbol=f"mean{reduction.symbol.removeprefix(operator)}", operator="mean"
+            )
+        return symbol(reduction.symbol) * (1 if reduction.operator == operator else count), [reduction]
+    sum_of_terms, reductions = ZERO, list[PeerReduction]()
+    for (value, aged), coefficient in linear_parts.items():
+        send, before = values.get(value, (any_send, False))
+        multiplicity = count if operator == "sum" and value is None else 1
         if value is None and not aged:
-            total += many * coefficient
+            sum_of_terms += multiplicity * coefficient
             continue
         age = "" if not aged else "alone" if value is None else "factor"
-        peer_type = (
-            operator if many == 1 else "mean"
-        )  # a sum of ages is their mean times the number of senders
-        name = f"{peer_type}({f'previous(others.{send})' if before else TEXTS[age].format(send)})"
-        received.append(replace(whole, symbol=name, operator=peer_type, send=send, age=age, before=before))
-        total += many * coefficient * symbol(name)
-    return total, received
+        # A sum of ages is their mean times the number of senders.
+        term_operator = operator if multiplicity == 1 else "mean"
+        name = f"{term_operator}({f'previous(others.{send})' if before else TEXTS[age].format(send)})"
+        reductions.append(
+            replace(reduction, symbol=name, operator=term_operator, send=send, age=age, before=before)
+        )
+        sum_of_terms += multiplicity * coefficient * symbol(name)
+    return sum_of_terms, reductions
 
 
 def _linear_parts(term: Term, values: Set[Symbol]) -> dict[tuple[Symbol | None, bool], Term] | None:
-    """Return a term's coefficients of sent values, None for the rest, and whether multiplied by the age.
+    """Return the coefficients of a term by sent value, and by whether the value is multiplied by the age.
 
-    None if it isn't a sum of such.
+    The key None is for the term without a sent value. The result is None if the term is not linear.
     """
-    bent = any(not atom.free_symbols.isdisjoint({*values, AGE}) for atom in term.atoms(sympy.Function))
-    form = None if bent else linear_form(term, values)
+    nonlinear = any(not atom.free_symbols.isdisjoint({*values, AGE}) for atom in term.atoms(sympy.Function))
+    form = None if nonlinear else linear_form(term, values)
     if form is None:
         return None
     parts: dict[tuple[Symbol | None, bool], Term] = {}

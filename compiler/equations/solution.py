@@ -1,4 +1,4 @@
-"""Equations as residuals and their solution: assignments, and loops that an iteration has to solve.
+"""Equations as residuals, and their solution: assignments, and loops solved by iteration.
 
 Takes: nothing (data types).
 Gives: `Residual`, `Problem`; `Assignment`, `ImplicitBlock`, their union `Step`, `Definition`; `listed`,
@@ -17,7 +17,7 @@ from apc.compiler.equations.flatten import FlatEquation
 from apc.compiler.equations.terms import NoDerivativeError, Symbol, Term, symbol
 from apc.compiler.errors import ApcError, Diagnostic, Mistakes, SourceLocation
 
-Assignment = tuple[str, Term]  # an unknown, and the expression that gives it
+Assignment = tuple[str, Term]  # an unknown, and the expression of its value
 MOST_LISTED = 8  # equations or unknowns in one message
 
 
@@ -30,7 +30,7 @@ class Residual:
 
     @property
     def shown(self) -> str:
-        """The equation as the user wrote it, and where it comes from."""
+        """The equation as text in the user's spelling, with its origin."""
         return f"`{self.equation.text}` ({self.equation.origin})"
 
 
@@ -38,7 +38,8 @@ class Residual:
 class Problem:
     """The context of a solution: the test of divisors, and the collector of errors.
 
-    `where` is the name of the equations in messages; `location` is used when there are none.
+    `where` is the name of the equations in messages; `location` is the location of errors without an
+    equation.
     """
 
     where: str
@@ -46,38 +47,40 @@ class Problem:
     divisors: Divisors
     mistakes: Mistakes
 
-    def fault(self, code: str, residuals: Sequence[Residual], message: str, hint: str = "") -> ApcError:
+    def fault(self, code: str, residuals: Sequence[Residual], message: str, advice: str = "") -> ApcError:
         """Return an error located at the first of some equations.
 
         Parameters
         ----------
-        code, message, hint
-            The diagnostic's.
+        code, message, advice
+            The code, message and fix of the diagnostic.
         residuals
-            The equations; without one, the part has the location.
+            The equations; if there is none, the error is located at the part.
         """
         location = residuals[0].equation.location if residuals else self.location
-        return ApcError(Diagnostic(code, location, message, hint=hint))
+        return ApcError(Diagnostic(code, location, message, advice=advice))
 
     def no_number(self, residuals: Sequence[Residual]) -> ApcError:
-        """Return the mistake E512: equations in which a constant is none, maybe after others are put in."""
-        holds = f"{listed(residuals)} hold{'s' if len(residuals) == 1 else ''}"
-        return self.fault("E512", residuals, f"{holds} a constant that is no number, such as 1/0 or sqrt(-1)")
+        """Return the error E512: equations with a constant that is not a number, possibly after
+        substitution.
+        """
+        holds = f"{listed(residuals)} contain{'s' if len(residuals) == 1 else ''} a constant that is"
+        return self.fault("E512", residuals, f"{holds} undefined or too large, such as 1/0 or sqrt(-1)")
 
     def no_derivative(self, residual: Residual, missing: NoDerivativeError) -> ApcError:
         """Return the error E508: the derivative of an equation is required, but a term has none."""
         message = f"{residual.shown} needs the derivative of {missing}"
         return self.fault(
-            "E508", [residual], f"{message}; a position follows such a force only through a mass"
+            "E508", [residual], f"{message}; connect such a force to a position only through a mass"
         )
 
 
 @dataclass(frozen=True, slots=True)
 class ImplicitBlock:
-    """A nonlinear loop: find the `tearing` unknowns that make every residual zero.
+    """A nonlinear loop: its solution is the `tearing` unknowns for which every residual is zero.
 
-    `inner` computes the other unknowns, in this order, from the tearing unknowns. Unknowns keep the order of
-    the model's.
+    `inner` computes the other unknowns, in this order, from the tearing unknowns. `unknowns` has all unknowns
+    in the order of the model.
     """
 
     unknowns: tuple[str, ...]
@@ -87,12 +90,12 @@ class ImplicitBlock:
 
     @property
     def expressions(self) -> tuple[Term, ...]:
-        """The expressions it consists of."""
+        """The expressions of the block: residuals and inner assignments."""
         return (*self.residuals, *(value for _, value in self.inner))
 
     @property
     def free_symbols(self) -> set[Symbol]:
-        """The symbols the block's solution depends on."""
+        """The symbols that the solution of the block depends on."""
         result = {s for expression in self.expressions for s in expression.free_symbols}
         return result - {symbol(name) for name in self.unknowns}
 
@@ -107,7 +110,7 @@ Definition = Term | ImplicitBlock  # defines the value of an unknown
 
 
 def listed(texts: Sequence[str | Residual]) -> str:
-    """Join the first few texts, or equations, with the number of the others."""
+    """Return the text of the first few texts or equations, with the number of the others."""
     shown = [text.shown if isinstance(text, Residual) else text for text in texts[:MOST_LISTED]]
     more = len(texts) - MOST_LISTED
     return ", ".join(shown) + (f" and {more} more" if more > 0 else "")

@@ -1,10 +1,10 @@
-"""Terms written as CasADi's, each definition once.
+"""Translation of terms to CasADi expressions, each definition once.
 
 Takes: `SortedPeerType`. Gives: `CasadiWriter`.
-Guarantees: written in the order in which things depend on one another, and nothing that isn't needed; a chain
-of definitions may be as long as it likes; what a nonlinear loop finds is a symbol, and a function that needs
-it solves the loop by Newton's iteration first.
-Does not: choose the written expressions (see `functions`).
+Guarantees: only required definitions are translated, in order of dependence; the length of a chain of
+definitions is not limited; the solution of a nonlinear loop is a symbol, and a function that requires the
+solution solves the loop by Newton's iteration first.
+Does not: choose the expressions (see `functions`).
 """
 
 from __future__ import annotations
@@ -28,8 +28,9 @@ from apc.compiler.expression_data import AlgebraicLoop, composed
 from apc.compiler.interpolation import Interpolation, function_of
 from apc.compiler.language.expression import SMOOTH
 
-MOST_FACTORS = 100  # of a power that is written as a product
-# Functions that are infinite or no number somewhere, or whose slopes are; and where none of them is.
+MOST_FACTORS = 100  # the largest exponent of a power computed as a product
+# Functions that, or whose derivatives, are infinite or undefined for some arguments; a regular argument of
+# all.
 _SOMEWHERE_NONE = ("exp", "log", "tan", "asin", "acos", "sinh", "cosh", "atan2")
 HARMLESS = 0.5
 Crossing = TypeVar("Crossing", HoldCrossing, PreviousCrossing, PeerReduction)
@@ -54,13 +55,14 @@ _CASADI: dict[str, Callable[..., Any]] = {
 
 
 class CasadiWriter:
-    """Translates terms of a peer type to CasADi's SX, each definition once.
+    """The translation of a peer type's terms to CasADi's SX, each definition once.
 
-    `known` are the symbols written so far: what has no definition is a symbol of its own there, which crosses
-    into the subsystem, or is one of the `parameters`, the numbers and start values that were needed.
+    `known` are the symbols translated so far. A symbol without a definition becomes an SX symbol: it crosses
+    into the subsystem, or it is one of the `parameters`, the required numbers and start values.
     """
 
     def __init__(self, peer_type: SortedPeerType) -> None:
+        """Collect the definitions, tables, start values and crossings of a peer type."""
         flat = peer_type.clocked.flat
         self.peer_type = peer_type
         self.definitions = peer_type.definitions
@@ -76,18 +78,20 @@ class CasadiWriter:
         self.loops: list[tuple[Any, Any, Any]] = []  # unknowns (n,), their start values, the residuals
 
     def follow(self, received: Collection[str]) -> None:
-        """Write the dependencies of states, limited signals and received sends.
+        """Translate the dependencies of states, limited variables and received sends.
 
-        The expression of a used crossing is written too; its dependencies in the next call.
+        The expressions of used crossings are translated too; their dependencies in the next call.
         """
         clocked = self.peer_type.clocked
-        stored = [number.variable for number in self.read(clocked.previous)]
+        stored = [crossing.variable for crossing in self.read(clocked.previous)]
         for name in (*self.peer_type.states, *stored):
             self.parameter(name)
         limited = [variable.name for variable in clocked.flat.variables if variable.limit]
-        held = [number.variable for number in self.read(clocked.holds)]
+        held = [crossing.variable for crossing in self.read(clocked.holds)]
         self.column([*map("der({})".format, self.peer_type.states), *limited, *held, *stored])
-        edges = [number.edge for number in self.read(self.peer_type.receives) if number.edge is not None]
+        edges = [
+            crossing.edge for crossing in self.read(self.peer_type.receives) if crossing.edge is not None
+        ]
         for expression in (
             *edges,
             *(send.expression for send in self.peer_type.sends if send.name in received),
@@ -95,7 +99,7 @@ class CasadiWriter:
             self.write(expression)
 
     def column(self, names: Iterable[str]) -> Any:
-        """Return the values of some names as a dense column, (0, 1) when there are none."""
+        """Return the values of names as a dense column, (0, 1) if there are none."""
         return casadi.densify(casadi.vertcat(casadi.SX(0, 1), *(self.write(symbol(name)) for name in names)))
 
     def parameter(self, name: str) -> Any:
@@ -103,7 +107,7 @@ class CasadiWriter:
         return self.parameters.setdefault(name, casadi.SX.sym(name))
 
     def read(self, crossings: Iterable[Crossing]) -> list[Crossing]:
-        """Return the crossings whose symbols were needed."""
+        """Return the crossings whose symbols are required."""
         return [crossing for crossing in crossings if symbol(crossing.symbol) in self.known]
 
     def function(self, name: str, inputs: Mapping[str, Any], output: str, value: Any) -> Any:
@@ -124,30 +128,30 @@ class CasadiWriter:
             The SX expression to compute.
         """
         words, columns = list(inputs), list(inputs.values())
-        solved, requested = list[Any](), value  # the unknowns of the loops that the value needs, in order
-        needed: list[tuple[Any, Any, Any]] = []
+        solved, required = list[Any](), value  # the unknowns of the loops that the value needs, in order
+        loops_in_use: list[tuple[Any, Any, Any]] = []
         for z, begin, residual in reversed(self.loops):
-            if casadi.depends_on(requested, z):
-                needed.insert(0, (z, begin, residual))
-                requested = casadi.vertcat(requested, begin, residual)
-        if not needed:
+            if casadi.depends_on(required, z):
+                loops_in_use.insert(0, (z, begin, residual))
+                required = casadi.vertcat(required, begin, residual)
+        if not loops_in_use:
             return casadi.Function(name, columns, [value], words, [output])
         loops = []
-        for z, begin, residual in needed:
+        for z, begin, residual in loops_in_use:
             q = casadi.vertcat(*(s for s in casadi.symvar(residual) if not casadi.depends_on(s, z)))
             given = casadi.Function("given", [*columns, *solved], [begin, q])
             loops.append(AlgebraicLoop(given, casadi.Function("residual", [z, q], [residual])))
             solved.append(z)
-        more = [f"z{index}" for index in range(len(solved))]
-        result = casadi.Function("result", [*columns, *solved], [value], [*words, *more], [output])
+        solved_names = [f"z{index}" for index in range(len(solved))]
+        result = casadi.Function("result", [*columns, *solved], [value], [*words, *solved_names], [output])
         return composed(name, loops, result, words)
 
-    def write(self, requested: Term) -> Any:
-        """Return the value of an expression, after its dependencies.
+    def write(self, expression: Term) -> Any:
+        """Return the SX value of an expression, after translation of its dependencies.
 
-        A stack instead of recursion, so that the length of a chain of definitions is no limit.
+        An explicit stack replaces recursion, so that the length of a chain of definitions is not limited.
         """
-        work = self._needed(requested)
+        work = self._needed(expression)
         while work:
             s, definition = work[-1], self.definitions.get(work[-1])
             if s in self.known:
@@ -162,28 +166,31 @@ class CasadiWriter:
                 self._tear(definition)
             else:
                 self.known[s] = self._build(definition)
-        return self._build(requested)
+        return self._build(expression)
 
     def _needed(self, expression: Definition) -> list[Symbol]:
-        """Return the symbols that have to be written before an expression."""
+        """Return the symbols of an expression that are not yet translated."""
         return [
             s for s in in_order(expression.free_symbols) if s not in self.known and s.name not in self.tables
         ]
 
     def _tear(self, loop: ImplicitBlock) -> None:
-        """Make known the unknowns of a loop that are torn; the others follow from them."""
+        """Add the tearing unknowns of a nonlinear loop as symbols.
+
+        The other unknowns are computed from them.
+        """
         z = casadi.SX.sym("z", len(loop.tearing))
         begin = casadi.vertcat(*(self.parameter(x) if x in self.started else 0 for x in loop.tearing))
         self.known |= {symbol(name): z[i] for i, name in enumerate(loop.tearing)}
         self.definitions |= {symbol(name): expression for name, expression in loop.inner}
         self.loops.append((z, begin, casadi.densify(casadi.vertcat(*map(self.write, loop.residuals)))))
 
-    def _build(self, expression: Term, used: Any = None) -> Any:
-        """Return the value of an expression with known symbols.
+    def _build(self, expression: Term, active: Any = None) -> Any:
+        """Return the SX value of an expression whose symbols are translated.
 
-        `used` is the condition of its branch. CasADi computes every branch, and multiplies the derivatives
-        of inactive ones by 0, which is NaN if they are infinite. A singular function therefore gets a regular
-        argument if its branch is inactive.
+        `active` is the condition of its branch, None outside of branches. CasADi computes every branch, and
+        multiplies the derivatives of inactive branches by 0, which is NaN if they are infinite. A singular
+        function therefore gets a regular argument if its branch is inactive.
         """
         if expression.is_Symbol:
             return self.known[expression]
@@ -192,44 +199,46 @@ class CasadiWriter:
         if expression.is_NumberSymbol:
             return casadi.SX(float(expression))
         if expression.is_Mul or expression.is_Pow:
-            return self._product(expression, used)
+            return self._product(expression, active)
         name = "+" if expression.is_Add else NAMES.get(expression.func)
-        if name is None:  # a cotangent, which SymPy makes of some tangents
-            return self._build(expression.rewrite(tan), used)
-        if name == "interpolate":  # a table's value, linear between its rows and constant beyond its ends
+        if name is None:  # a cotangent, to which SymPy converts some tangents
+            return self._build(expression.rewrite(tan), active)
+        if name == "interpolate":  # linear between the rows of a table, constant beyond its ends
             rows = self.tables[expression.args[0].name]
             return function_of(Interpolation(rows.times, rows.numbers))(self._build(expression.args[1]))
         if name == "if":
-            holds = self._build(expression.args[0], used)
-            within = [holds, casadi.logic_not(holds)]
-            if used is not None:
-                within = [casadi.logic_and(used, item) for item in within]
-            return casadi.if_else(holds, *map(self._build, expression.args[1:], within))
-        arguments = [self._build(argument, used) for argument in expression.args]
-        if used is not None and name in _SOMEWHERE_NONE:
-            arguments = [casadi.if_else(used, argument, HARMLESS) for argument in arguments]
+            condition = self._build(expression.args[0], active)
+            conditions = [condition, casadi.logic_not(condition)]
+            if active is not None:
+                conditions = [casadi.logic_and(active, item) for item in conditions]
+            return casadi.if_else(condition, *map(self._build, expression.args[1:], conditions))
+        arguments = [self._build(argument, active) for argument in expression.args]
+        if active is not None and name in _SOMEWHERE_NONE:
+            arguments = [casadi.if_else(active, argument, HARMLESS) for argument in arguments]
         function = _CASADI[name]
         return functools.reduce(function, arguments) if name in ("+", "max", "min") else function(*arguments)
 
-    def _product(self, term: Term, used: Any) -> Any:
-        """Return a product, with division by factors of negative power: a*(1/b) rounds twice."""
-        above, below, moving = casadi.SX(1), casadi.SX(1), False
+    def _product(self, term: Term, active: Any) -> Any:
+        """Return a product; factors with negative powers are a divisor, since a*(1/b) is rounded twice."""
+        numerator, denominator, is_variable = casadi.SX(1), casadi.SX(1), False
         for factor in Mul.make_args(term):
             base, exponent = factor.args if factor.is_Pow else (factor, ONE)
             if exponent.is_negative:
-                below *= self._power(base, -exponent, used)
-                moving = moving or bool(base.free_symbols)
+                denominator *= self._power(base, -exponent, active)
+                is_variable = is_variable or bool(base.free_symbols)
             else:
-                above *= self._power(base, exponent, used)
-        return above / (casadi.if_else(used, below, 1) if used is not None and moving else below)
+                numerator *= self._power(base, exponent, active)
+        return numerator / (
+            casadi.if_else(active, denominator, 1) if active is not None and is_variable else denominator
+        )
 
-    def _power(self, base: Term, exponent: Term, used: Any) -> Any:
+    def _power(self, base: Term, exponent: Term, active: Any) -> Any:
         """Return a power with a positive exponent."""
-        value = self._build(base, used)
-        if not exponent.is_Integer and used is not None:
-            value = casadi.if_else(used, value, 1)
+        value = self._build(base, active)
+        if not exponent.is_Integer and active is not None:
+            value = casadi.if_else(active, value, 1)
         if exponent == HALF:
             return casadi.sqrt(value)
         if exponent.is_Integer and exponent <= MOST_FACTORS:
             return functools.reduce(operator.mul, [value] * int(exponent))
-        return value ** self._build(exponent, used)
+        return value ** self._build(exponent, active)

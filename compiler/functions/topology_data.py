@@ -2,8 +2,8 @@
 
 Takes: `Topology`, and the peer types with their functions. Gives: `Timings`; `used_links`, `check_links`,
 `used_clocks`; `compiled_groups`, `with_rounded`; `all_parameters`, `followers_of`.
-Guarantees: periods, phases and delays stay exact; dependent values have their formulas.
-Does not: write functions.
+Guarantees: periods, phases and delays are exact; dependent values have their formulas.
+Does not: build functions.
 """
 
 from __future__ import annotations
@@ -49,11 +49,11 @@ from apc.compiler.topology.topology import Topology
 from apc.compiler.wording import enumerated
 
 NO_DELAY = "no delay"
-Path = tuple[str, ...]  # a name, between its dots
+Path = tuple[str, ...]  # a name, split at its dots
 
 
 class Timings:
-    """The periods, phases and delays that the model refers to, each once."""
+    """The periods, phases and delays that the model refers to, without repetition."""
 
     def __init__(self, topology: Topology) -> None:
         self.topology = topology
@@ -69,16 +69,19 @@ class Timings:
         return tuple(self._result.values())
 
     def use(self, name: str, value: ScalarValue) -> str:
-        """Register a timing and return its name."""
+        """Register a timing, and return its name."""
         self._result.setdefault(name, Timing(name, value.number, _formula(value.expression)))
         return name
 
     def delay(self, hold: HoldCrossing, peer_type: FlatPeerType) -> str:
-        """Register the delay of a hold: none, a parameter of a part, or an expression over such."""
+        """Register the delay of a hold, and return its name: none, a parameter, or an expression over
+        parameters.
+        """
         if hold.delay == ZERO:
             return self.use(NO_DELAY, ScalarValue(ZERO.value, SECOND, None, SourceLocation("")))
 
         def number(parts: Path) -> Fraction:
+            """Return the value of a name in the expression of a delay."""
             return Fraction(self.topology.peers) if parts == (PEERS,) else self._result[".".join(parts)].value
 
         tree = renamed(
@@ -91,21 +94,23 @@ class Timings:
         return self.use(name, ScalarValue(value, SECOND, tree, hold.location))
 
     def _parameter(self, parts: Path, peer_type: FlatPeerType) -> Path:
-        """Register a delay parameter, under the group's name if it sets its own; return its name's parts.
+        """Register a delay parameter, and return its name, split at its dots.
 
-        What a group's own number depends on is its own as well, if it has one of that name.
+        A delay set by the group of the peer type has the group's name in front, and so have the group's
+        numbers it depends on.
         """
-        name, local = ".".join(parts), dict(peer_type.delays)
-        if name not in local:
+        name, group_delays = ".".join(parts), dict(peer_type.delays)
+        if name not in group_delays:
             self.use(name, self._values[name])
             return parts
-        tree = local[name].expression
+        tree = group_delays[name].expression
         if tree is not None:
             tree = renamed(
-                tree, lambda texts: self._parameter(texts, peer_type) if ".".join(texts) in local else texts
+                tree,
+                lambda texts: self._parameter(texts, peer_type) if ".".join(texts) in group_delays else texts,
             )
         return tuple(
-            self.use(f"{peer_type.groups[0]}.{name}", replace(local[name], expression=tree)).split(".")
+            self.use(f"{peer_type.groups[0]}.{name}", replace(group_delays[name], expression=tree)).split(".")
         )
 
 
@@ -117,7 +122,7 @@ def used_links(topology: Topology, peer_types: Sequence[PeerType], timings: Timi
     topology, peer_types
         All links, and their receivers.
     timings
-        Collects the delays of the links in use.
+        The collection to which the delays of the links in use are added.
     """
     received = {
         receive.link for peer_type in peer_types for clock in peer_type.clocks for receive in clock.receives
@@ -126,8 +131,8 @@ def used_links(topology: Topology, peer_types: Sequence[PeerType], timings: Timi
     for link in (link for link in topology.links if link.name in received):
         pairs = ((delay, f"{link.name}.delays.{delay.sender}.{delay.receiver}") for delay in link.delays)
         delays = tuple(
-            PairDelay(topology_delay.sender, topology_delay.receiver, timings.use(name, topology_delay.delay))
-            for topology_delay, name in pairs
+            PairDelay(declared.sender, declared.receiver, timings.use(name, declared.delay))
+            for declared, name in pairs
         )
         delay, channel, channel_declaration = (
             timings.use(f"{link.name}.delay", link.delay),
@@ -156,16 +161,16 @@ def used_links(topology: Topology, peer_types: Sequence[PeerType], timings: Timi
 def used_clocks(
     topology: Topology, peer_types: Sequence[PeerType], links: Sequence[Link], timings: Timings
 ) -> tuple[Clock, ...]:
-    """Return the clocks that something ticks with.
+    """Return the clocks of links and partitions in use.
 
     Parameters
     ----------
     topology
-        The topology, all of its clocks.
+        The topology with all clocks.
     peer_types, links
-        The peer types with their clocks.
+        The peer types and links in use, which refer to clocks.
     timings
-        Collects the periods and phases in use.
+        The collection to which the periods and phases in use are added.
     """
     used = {link.clock for link in links} | {
         clock.clock for peer_type in peer_types for clock in peer_type.clocks
@@ -184,7 +189,7 @@ def used_clocks(
 
 
 def check_links(topology: Topology, peer_types: Sequence[PeerType], indices: Sequence[int]) -> None:
-    """Refuse a link that cannot provide the values its receivers need.
+    """Raise ApcError for a link that cannot provide the values its receivers require.
 
     Parameters
     ----------
@@ -196,8 +201,8 @@ def check_links(topology: Topology, peer_types: Sequence[PeerType], indices: Seq
     Raises
     ------
     ApcError
-        E215 a link over which only some peers send a value: receivers would miss those of the others. E801 a
-        graph, given arc by arc, without senders to a peer with a mean, maximum or minimum.
+        E215 a link over which only some peers send a value: the values of the others would be missing. E801 a
+        graph, given as arcs, without senders to a peer with a mean, maximum or minimum.
     """
     mistakes = Mistakes()
     for link in topology.links:
@@ -210,12 +215,14 @@ def check_links(topology: Topology, peer_types: Sequence[PeerType], indices: Seq
         every = [channel for _, channels in sent for channel in channels]
         missing = ((name, text) for text in every for name, channels in sent if text not in channels)
         for name, channel in islice(missing, 1):
-            message = f"{channel} travels over {link.name}, and those of {name} send other values over it"
-            hint = "a link of its own for what only some groups send"
-            mistakes.add("E215", link.location, message, hint=hint)
+            message = f"{channel} is sent over {link.name}, but the peers of {name} send other values over it"
+            advice = "use a separate link for values that only some groups send"
+            mistakes.add("E215", link.location, message, advice=advice)
     mistakes.raise_if_any()
     groups, counts = topology.groups, [group.count for group in topology.groups]
-    for link in (link for link in topology.links if link.graph.shape == "arcs"):  # else all have senders
+    for link in (
+        link for link in topology.links if link.graph.shape == "arcs"
+    ):  # in other graphs all peers have senders
         owner = np.repeat(np.arange(len(groups)), counts)
         used = [_undefined_reduction(peer_types[index], link.name) for index in indices]
         sends = [any(send.link == link.name for send in peer_types[index].sends) for index in indices]
@@ -228,19 +235,25 @@ def check_links(topology: Topology, peer_types: Sequence[PeerType], indices: Seq
         names = [f"{groups[k].name}[{index - sum(counts[:k]) + 1}]" for k, index in first]
         if len(deaf) > len(names):
             names.append(f"{len(deaf) - len(names)} more")
-        receive = f"{enumerated(names)} {'hears' if len(deaf) == 1 else 'hear'} nobody over {link.name}"
-        message = f"{receive}: there is no {used[first[0][0]]} over nobody"
-        hint = f"an arc to {'each' if len(deaf) > 1 else names[0]} in its graph"
+        receive = (
+            f"{enumerated(names)} {'has' if len(deaf) == 1 else 'have'} no incoming connection over "
+            f"{link.name}"
+        )
+        message = f"{receive}, so {used[first[0][0]]}() is undefined"
+        advice = f"add an arc to {'each' if len(deaf) > 1 else names[0]} in the graph"
         receiving = np.bincount(owner[deaf], minlength=len(groups)) < counts
         if not receiving.all() and receiving.any():
             others = [group.name for group, receives in zip(groups, receiving, strict=True) if receives]
-            hint += f", or at: [{', '.join(others)}] in what uses {link.name}"
-        mistakes.add("E801", link.location, message, hint=hint)
+            advice += f", or use at: [{', '.join(others)}] in the couplers of {link.name}"
+        mistakes.add("E801", link.location, message, advice=advice)
     mistakes.raise_if_any()
 
 
 def _undefined_reduction(peer_type: PeerType, link: str) -> str:
-    """Return the peer type's `mean`, `max` or `min` over a link, undefined without senders; "" if none."""
+    """Return the first `mean`, `max` or `min` of a peer type over a link: undefined without senders.
+
+    The result is "" if there is none.
+    """
     operators = (
         receive.operator for clock in peer_type.clocks for receive in clock.receives if receive.link == link
     )
@@ -254,9 +267,9 @@ def compiled_groups(
     links: Sequence[Link],
     timings: Timings,
 ) -> tuple[Group, ...]:
-    """Return the compiled groups with their numbers of senders.
+    """Return the compiled groups, with their numbers of senders.
 
-    A group value that is also a timing is replaced by a reference to that timing.
+    A group value that is also a timing is replaced by a reference to this timing.
 
     Parameters
     ----------
@@ -289,14 +302,15 @@ def compiled_groups(
         silent = [group.name for group in groups if not sending[group.peer_type]]
         if silent and any(count_of(link.name) in peer_type.parameters for peer_type in peer_types):
             message = (
-                f"the graph of {link.name} joins all peers, and those of {silent[0]} send nothing over it"
+                f"the graph of {link.name} connects all peers, but the peers of {silent[0]} do not send "
+                "over it"
             )
             raise ApcError(Diagnostic("E215", link.location, message))
     return with_received(groups, peer_types, links)
 
 
 def with_rounded(topology: Topology, peer_type: PeerType, links: Sequence[Link]) -> PeerType:
-    """Return a peer type with the rounded counts of senders marked.
+    """Return a peer type with the numbers of senders whose floats are rounded, and their exact values.
 
     Raises
     ------
@@ -310,10 +324,13 @@ def with_rounded(topology: Topology, peer_type: PeerType, links: Sequence[Link])
             values = set(received_sums(link, topology.peers).tolist())
             if len(set(map(float, values))) < len(values):
                 message = (
-                    f"what two peers hear over {link.name} adds up to sums that doubles can't tell apart"
+                    f"the weights of two peers over {link.name} add up to sums that differ by less than "
+                    "rounding"
                 )
                 raise ApcError(
-                    Diagnostic("E217", locations[link.name], message, hint="weights of at most 15 digits")
+                    Diagnostic(
+                        "E217", locations[link.name], message, advice="use weights of at most 15 digits"
+                    )
                 )
             if any(Fraction(float(value)) != value for value in values):
                 rounded.append((peer_type.parameters.index(count_of(link.name)), tuple(sorted(values))))
@@ -332,7 +349,7 @@ def _named(
     *,
     exclusive_minimum: bool = False,
 ) -> Parameter:
-    """Return a number as a parameter."""
+    """Return a number as a parameter of the model, with unit, formula, bounds and description."""
     unit, formula = format_dimension(value.dimension), _formula(value.expression)
     least, most = (None if item is None else float(item) for item in (minimum, maximum))
     return Parameter(
@@ -374,14 +391,17 @@ def _of_part(
 def all_parameters(
     topology: Topology, peer_types: Sequence[PeerType], links: Sequence[Link]
 ) -> tuple[Parameter, ...]:
-    """Return every parameter of the topology: named ones, each part's, start values in use, those of links.
+    """Return every parameter of the topology.
+
+    These are the named numbers, the numbers of parts, the start values in use, the probabilities of links,
+    periods in equations, and numbers of peers and senders.
 
     Parameters
     ----------
     topology
-        Their values.
+        The topology, with the values.
     peer_types, links
-        What is compiled: whose start values and counts are in use, and which links.
+        The compiled peer types, whose parameters are in use, and the links in use.
     """
     declared = _declared(topology)
     needed = {name for peer_type in peer_types for name in peer_type.parameters}
@@ -389,9 +409,11 @@ def all_parameters(
     parameters = [_named(name, value) for name, value in topology.parameters]
     for part in topology.parts:
         numbers = dict(part.values) | {
-            local: value for local, value in part.all_starts if f"{part.name}.{local}" in needed
+            variable: value for variable, value in part.all_starts if f"{part.name}.{variable}" in needed
         }
-        parameters += [_of_part(f"{part.name}.{local}", value, declared) for local, value in numbers.items()]
+        parameters += [
+            _of_part(f"{part.name}.{number}", value, declared) for number, value in numbers.items()
+        ]
     for link in topology.links:
         if count_of(link.name) in needed:  # every group has its own value
             parameters.append(
@@ -401,7 +423,7 @@ def all_parameters(
             probabilities = zip(link.channel.loss, PROBABILITIES.values(), strict=False)
             parameters += [_named(*number, description, 0, 1) for number, description in probabilities]
     for clock in topology.clocks:
-        if (name := f"{clock.name}.period") in needed:  # by `interval`: the same number as the timing
+        if (name := f"{clock.name}.period") in needed:  # used by `interval`: the same number as the timing
             description = f"from one tick of {clock.name} to the next"
             parameters.append(_named(name, clock.period, description, 0, exclusive_minimum=True))
     for group in topology.groups:
@@ -414,28 +436,32 @@ def all_parameters(
 
 
 def _most_peers(topology: Topology, group: GroupDeclaration) -> float | None:
-    """Return the possible numbers of peers of a group, the others unchanged, by the component limits."""
-    counts = {group.name: group.count for group in topology.groups}
-    room = [
+    """Return the largest number of peers of a group that its components allow, the other groups unchanged.
+
+    The result is None if the number is not limited.
+    """
+    counts = {other.name: other.count for other in topology.groups}
+    limits = [
         part.component.peers - sum(counts[name] for name in part.groups if name != group.name)
         for part in topology.parts
         if part.component.peers and group.name in part.groups
     ]
-    return float(min(room)) if room else None
+    return float(min(limits)) if limits else None
 
 
 def followers_of(
     parameters: Sequence[Parameter], timings: Sequence[Timing], groups: Sequence[Group]
 ) -> tuple[str, ...]:
-    """Return the names of all dependent parameters, each after its dependencies."""
+    """Return the names of all dependent parameters and timings, each after its dependencies."""
     numbers: list[Parameter | Timing] = [*parameters, *timings]
-    followed, names = TopologicalSorter[str](), set[str]()
+    sorter, names = TopologicalSorter[str](), set[str]()
     for item in (*numbers, *(value for group in groups for value in group.values)):
         if item.formula is not None:
-            followed.add(item.name, *item.formula.names)
+            sorter.add(item.name, *item.formula.names)
             names.add(item.name)
-    return tuple(name for name in followed.static_order() if name in names)
+    return tuple(name for name in sorter.static_order() if name in names)
 
 
 def _formula(expression: Expr | None) -> Formula | None:
+    """Return the formula of an expression, or None."""
     return None if expression is None else formula_of(expression)

@@ -1,8 +1,8 @@
-"""Constants in equations, bounded before anything computes them exactly.
+"""Bounds on constants in equations, checked before any exact computation.
 
 Takes: the sides of equations. Gives: `check_constants`.
-Guarantees: an equation that passes holds no constant whose exact value takes more than MOST_BITS bits, and
-none that leaves the range of floats.
+Guarantees: a checked equation has no constant whose exact value has more than MOST_BITS bits, and no constant
+outside the range of floats.
 Does not: refuse constants without a real value, such as 1/0 (see `equations.terms`).
 """
 
@@ -16,15 +16,15 @@ from apc.compiler.language.evaluation import EvaluationError, constant_value
 from apc.compiler.language.expression import Call, Expr, Name, NumberLiteral, children, format_expression
 from apc.compiler.source.reading import brief
 
-# Of the integer coefficients that powers and products can make: a power of a power of a power reaches 2^10^6.
+# The largest number of bits of the coefficients of powers and products: nested powers can reach 2^10^6.
 MOST_BITS = 1 << 15
-LEAST = 2.0**-1022  # the least normal float
+LEAST = 2.0**-1022  # the smallest normal float
 RANGE = "constants between 2.2e-308 and 1.8e308"
 POWERS = ("^", "*", "/", "exp", "sinh", "cosh")
 
 
 def check_constants(expression: Expr, text: str, location: SourceLocation) -> None:
-    """Refuse constants that are too large, too small or too long.
+    """Raise ApcError for constants that are too large, too small or too long.
 
     Parameters
     ----------
@@ -36,10 +36,11 @@ def check_constants(expression: Expr, text: str, location: SourceLocation) -> No
     Raises
     ------
     ApcError
-        E331 such a constant.
+        E331 a constant out of bounds.
     """
 
     def refuse(node: Expr, why: str) -> None:
+        """Raise ApcError (E331) located at a node."""
         message = f"{brief(format_expression(node))} {why}"
         raise ApcError(Diagnostic("E331", location_in(location, text, node.start), message, RANGE))
 
@@ -54,14 +55,14 @@ def check_constants(expression: Expr, text: str, location: SourceLocation) -> No
         if node.function == "^" and isinstance(exponent := node.arguments[1], NumberLiteral):
             total = inner[0] * abs(float(exponent.value)) + inner[1]
         if total > MOST_BITS:
-            refuse(node, f"makes a coefficient of more than {MOST_BITS} bits")
+            refuse(node, f"leads to a coefficient of more than {MOST_BITS} bits")
         return total
 
     def is_constant(node: Expr) -> bool:
-        """Return whether a subexpression is constant, its range checked from the inside out."""
+        """Return whether a subexpression is constant; checks the range of constants from the inside out."""
         if not isinstance(node, Call):
             return isinstance(node, NumberLiteral)
-        constant = [is_constant(part) for part in children(node)]  # each is checked
+        constant = [is_constant(part) for part in children(node)]  # no generator: all parts are checked
         if not all(constant):
             return False
         try:
@@ -69,7 +70,7 @@ def check_constants(expression: Expr, text: str, location: SourceLocation) -> No
         except EvaluationError as error:
             if isinstance(error.cause, OverflowError):
                 refuse(node, "is too large for a float")
-            return False  # no real value: nothing computes it
+            return False  # a constant without a real value is never computed
         if value is None:
             return False
         if node.function in POWERS and _is_tiny(value):
@@ -81,5 +82,7 @@ def check_constants(expression: Expr, text: str, location: SourceLocation) -> No
 
 
 def _is_tiny(value: Fraction | float) -> bool:
-    """Return whether a value is less than the least float, or a product or exponential rounded to zero."""
+    """Return whether a value is smaller than the smallest normal float, or a float that underflowed
+    to zero.
+    """
     return abs(float(value)) < LEAST and (value != 0 or isinstance(value, float)) and math.isfinite(value)

@@ -1,7 +1,7 @@
 """Tables in CSV files: columns with their units in the headings.
 
 Takes: a path. Gives: `read_table`, a `Table` in SI of `CsvColumn`s; `open_table`, `read_bytes`, for files
-with other cells than numbers; `NamedFiles`.
+whose cells are not all numbers; `NamedFiles`.
 Guarantees: every cell is a finite number, or an error names its file, line and column. The text of a file
 that is not a table is never printed, as it may be private. A number takes eight bytes.
 Does not: interpret columns.
@@ -30,13 +30,13 @@ from apc.compiler.language.units import NO_UNIT, Unit, parse_unit
 from apc.compiler.number_parsing import plain_float
 from apc.compiler.source.reading import brief, fault
 
-MAX_BYTES = 1 << 26  # 64 MiB: some eight million numbers, read in a few seconds
-PACKED = ".gz"  # the suffix of files that gzip packed
-MOST_COLUMNS = 1000  # more than a topology has parameters that differ from peer to peer
-MOST_MISTAKES = 20  # of one table; a wrong column has as many as rows
+MAX_BYTES = 1 << 26  # 64 MiB: about eight million numbers, read in a few seconds
+PACKED = ".gz"  # the suffix of files compressed by gzip
+MOST_COLUMNS = 1000  # more than the parameters of a topology that differ between peers
+MOST_MISTAKES = 20  # of one table, as every row of a wrong column has one
 _EXAMPLE = "device.mass [kg]"
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_.\[\]]*\Z")
-# The last bracket holds the unit; those before it, the index of an entry or of an element.
+# The last bracket has the unit; brackets before it have the index of a vector entry or an array element.
 _HEADING = re.compile(r"(?P<name>[^\[\]]*(\[[0-9]+\][^\[\]]*)*?)(\[(?P<unit>[^\[\]]*)\])?\Z")
 
 Headings = tuple[tuple[str, Unit, SourceLocation], ...]  # name, unit and location
@@ -47,14 +47,16 @@ F = TypeVar("F")
 
 @dataclass(frozen=True, slots=True)
 class NamedFiles:
-    """The files a topology names, of a `folder`: the `names` of those read, and all `mistakes`."""
+    """The reader of the files named by a topology: their `folder`, the `names` of the files read, and all
+    `mistakes`.
+    """
 
     folder: Path
     mistakes: Mistakes
     names: set[str] = field(default_factory=set)
 
     def read(self, name: str, reader: Callable[[Path], F]) -> F | None:
-        """Return the result of reading a file; None if invalid, with its errors collected."""
+        """Return the result of `reader` for a file; None if the file is invalid, with its errors recorded."""
         with self.mistakes:
             result = reader(self.folder / name)
             self.names.add(name)
@@ -64,7 +66,7 @@ class NamedFiles:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CsvColumn:
-    """A column: name and unit of its heading, its numbers in SI (rows,)."""
+    """A column of a table: name and unit of its heading, and its numbers (rows,) in SI units."""
 
     name: str
     unit: Unit
@@ -74,7 +76,7 @@ class CsvColumn:
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """A complete CSV file. `lines` are the line numbers of its rows."""
+    """The columns of a CSV file. `lines` are the line numbers of its rows."""
 
     file: str
     columns: tuple[CsvColumn, ...]
@@ -87,7 +89,7 @@ class Table:
 
 
 def read_table(path: Path, named_at: SourceLocation) -> Table:
-    """Read a CSV file of numbers below headings such as `device.mass [kg]`.
+    """Return the table in a CSV file of numbers below headings such as `device.mass [kg]`.
 
     Parameters
     ----------
@@ -99,12 +101,12 @@ def read_table(path: Path, named_at: SourceLocation) -> Table:
     Raises
     ------
     ApcError
-        E701 it can't be read, E702 a heading, E703 a row or cell is at fault.
+        E701 the file cannot be read, E702 a heading is invalid, E703 a row or cell is invalid.
     """
     with open_table(path, named_at) as opened:
         headings = opened.headings
         cells, lines = opened.numbers(
-            range(len(headings)), [plain_float] * len(headings), "a cell", "a finite number"
+            range(len(headings)), [plain_float] * len(headings), "cell", "a finite number"
         )
     numbers = cells.reshape(len(lines), len(headings))
     columns = tuple(
@@ -116,7 +118,7 @@ def read_table(path: Path, named_at: SourceLocation) -> Table:
 
 @dataclass(frozen=True, slots=True)
 class CsvReader:
-    """A CSV file whose headings are read, each a name, a unit and a place; `rows` are the rest."""
+    """An open CSV file: its headings (name, unit and location) and a reader of its `rows`."""
 
     file: str
     headings: Headings
@@ -131,7 +133,7 @@ class CsvReader:
         *,
         empty_too: bool = False,
     ) -> tuple[NDArray[np.float64], tuple[int, ...]]:
-        """Return the numbers of some columns, row after row, and the line that each row begins in.
+        """Return the numbers of some columns as one array, row by row, and the line number of each row.
 
         Parameters
         ----------
@@ -142,24 +144,24 @@ class CsvReader:
         subject, expected
             The name and the expected contents of a cell, for messages.
         empty_too
-            Read rows whose cells are all empty, too; a line without a character is no row.
+            Whether rows with only empty cells are read; a line without characters is never a row.
 
         Raises
         ------
         ApcError
-            E703 a row or cell is at fault, or there is none.
+            E703 a row or cell is invalid, or there is no row.
         """
         mistakes, numbers, lines, faulty = Mistakes(), array("d"), array("q"), set[int]()
         begin = self.rows.line_num + 1
         for cells in self.rows:
-            # A cell in quotes may go over several lines.
+            # A cell in quotes may have several lines.
             location, begin = SourceLocation(self.file, begin, 1), self.rows.line_num + 1
             filled = len(cells) > 1 or (cells and not cells[0].isspace())
             if not (filled if empty_too else any(map(str.strip, cells))):
                 continue
             lines.append(location.line)
             if len(cells) != len(self.headings):
-                reason = f"the row has {len(cells)} cells and there are {len(self.headings)} headings"
+                reason = f"row: expected {len(self.headings)} cells, one for each heading, got {len(cells)}"
                 mistakes.add("E703", location, reason)
                 faulty.add(location.line)
             else:
@@ -180,8 +182,10 @@ class CsvReader:
 
 
 @contextmanager
-def open_table(path: Path, named_at: SourceLocation, known: Collection[str] = ()) -> Iterator[CsvReader]:
-    """Open a CSV file and read its headings.
+def open_table(
+    path: Path, named_at: SourceLocation, known: Collection[str] = (), example: str = _EXAMPLE
+) -> Iterator[CsvReader]:
+    """Open a CSV file, read its headings, and yield a reader of its rows.
 
     Parameters
     ----------
@@ -189,13 +193,15 @@ def open_table(path: Path, named_at: SourceLocation, known: Collection[str] = ()
         As for `read_table`.
     known
         Names that are valid headings without a unit.
+    example
+        A heading, for messages.
 
     Raises
     ------
     ApcError
-        E701 it cannot be read, E702 its headings; E703 its rows are not CSV. Errors of the body are passed
-        on, except for a file that does not begin as a table: only that is reported, as its text may be
-        private.
+        E701 the file cannot be read, E702 the headings are invalid, E703 the rows are not CSV. Errors of the
+        `with` body are raised unchanged, except for a file that does not begin as a table: the only error is
+        E702, as its text may be private.
     """
     data = read_bytes(path, named_at)
     file = str(path)
@@ -203,31 +209,31 @@ def open_table(path: Path, named_at: SourceLocation, known: Collection[str] = ()
     first: list[str] = []
     try:
         first = next(rows, [])
-        yield CsvReader(file, _headings(first, file), rows)
+        yield CsvReader(file, _headings(first, file, example), rows)
     except csv.Error as error:
-        raise fault("E703", SourceLocation(file, rows.line_num or 1, 1), f"is no CSV: {error}") from None
+        raise fault("E703", SourceLocation(file, rows.line_num or 1, 1), f"invalid CSV: {error}") from None
     except ApcError:
         if not any(map(str.strip, first)) or _is_table(first, known):
             raise
         expected = "a name and its unit in each heading"
-        raise fault("E702", SourceLocation(file, 1, 1), "a table", expected, hint=_EXAMPLE) from None
+        raise fault("E702", SourceLocation(file, 1, 1), "table", expected, fix=example) from None
 
 
 def _is_table(headings: list[str], texts: Collection[str]) -> bool:
-    """Return whether a line is the first of a table: a heading has its unit, or there are several names."""
-    parts = [_parts(heading) for heading in headings]
+    """Return whether headings are those of a table: one name with a unit or in `texts`, or several names."""
+    parts = [_name_and_unit(heading) for heading in headings]
     return any(name in texts or (unit and _NAME.match(name)) for name, unit in parts) or (
         len(parts) > 1 and all(_NAME.match(name) and unit is None for name, unit in parts)
     )
 
 
 def read_bytes(path: Path, named_at: SourceLocation, *, any_text: bool = False) -> bytes:
-    """Return a file's bytes, unpacked if it is called .gz.
+    """Return the bytes of a file, decompressed if its suffix is .gz.
 
     Raises
     ------
     ApcError
-        E701 it can't be read, or isn't UTF-8 text all of it, unless any text will do.
+        E701 the file cannot be read, or is not UTF-8 text, unless `any_text`.
     """
     try:
         data = read_file(path, MAX_BYTES)
@@ -236,33 +242,35 @@ def read_bytes(path: Path, named_at: SourceLocation, *, any_text: bool = False) 
                 data = packed.read(MAX_BYTES + 1)
         if len(data) <= MAX_BYTES:
             if not any_text:
-                data.decode("utf-8-sig")  # all of it: what decodes piece by piece counts from where it is
+                # At once, so that the offset in an error is from the start of the file.
+                data.decode("utf-8-sig")
             return data
-        message = f"{path.name} unpacks to more than {MAX_BYTES >> 20} MiB"
+        message = f"{path.name} is larger than {MAX_BYTES >> 20} MiB when unpacked"
     except RefusedError as refused:
         message = f"the table {path} {refused.words}"
     except UnicodeDecodeError as error:
         message = f"{path.name} is not UTF-8 text (byte {error.start})"
     except (OSError, EOFError, zlib.error):
-        message = f"{path.name} is no whole gzip file"
+        message = f"{path.name} is not a complete gzip file"
     raise fault("E701", named_at, message)
 
 
-def _headings(texts: list[str], file: str) -> Headings:
+def _headings(texts: list[str], file: str, example: str) -> Headings:
+    """Return name, unit and location of each heading. Raises ApcError (E702) for invalid headings."""
     location = SourceLocation(file, 1, 1)
     if not any(text.strip() for text in texts):
-        raise fault("E702", location, "the table has no headings", hint=_EXAMPLE)
+        raise fault("E702", location, "the table has no headings", fix=example)
     if len(texts) > MOST_COLUMNS:
-        message = f"the table has {len(texts)} columns, and {MOST_COLUMNS} are the most"
-        raise fault("E702", location, message, hint="several groups, each with a table")
+        message = f"table: expected at most {MOST_COLUMNS} columns, got {len(texts)}"
+        raise fault("E702", location, message, advice="use several groups, each with a table")
     mistakes = Mistakes()
     result: dict[str, tuple[str, Unit, SourceLocation]] = {}
     for text in texts:
-        name, written = _parts(text)
+        name, written = _name_and_unit(text)
         unit = NO_UNIT
         if not name:
             expected, got = "a name and its unit", brief(text) or "nothing"
-            mistakes.add("E702", location, "a heading", expected=expected, got=got, hint=_EXAMPLE)
+            mistakes.add("E702", location, "heading", expected=expected, got=got, fix=example)
         try:
             unit = parse_unit(written, location) if written else NO_UNIT
         except ApcError as error:
@@ -275,8 +283,8 @@ def _headings(texts: list[str], file: str) -> Headings:
     return tuple(result.values())
 
 
-def _parts(heading: str) -> tuple[str, str | None]:
-    """Return the name and the unit of a heading, None if it has none; no name if it is no heading."""
+def _name_and_unit(heading: str) -> tuple[str, str | None]:
+    """Return the name and the unit of a heading: unit None if it has none, an empty name if it is invalid."""
     result = _HEADING.match(heading.strip())
     if result is None:
         return "", None

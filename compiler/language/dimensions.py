@@ -1,8 +1,8 @@
 """Physical dimensions: products of powers of SI base units.
 
 Takes: nothing (a data type). Gives: `Dimension` and its arithmetic; `DIMENSIONLESS`, `SECOND`.
-Guarantees: equal dimensions compare equal, however they came about; exponents are exact.
-Does not: know units, which have a scale as well (see `units`), or their text (see `unit_text`).
+Guarantees: equal dimensions compare equal, independent of their computation; exponents are exact.
+Does not: handle units, which also have a scale (see `units`), or their text (see `unit_text`).
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ class Dimension:
     turning: str = field(default="", compare=False)
 
     def clashes(self, other: Dimension) -> bool:
-        """Return whether one counts cycles and the other radians."""
+        """Return whether one dimension counts cycles and the other radians."""
         return {self.turning, other.turning} == {"Hz", "rad"}
 
     def multiply(self, other: Dimension, times: Fraction | int = 1) -> Dimension:
-        """Return the dimension of a product with another one's power."""
+        """Return the dimension of the product with a power of another dimension."""
         total: dict[str, Fraction | int] = dict(self.exponents)
         for base, power in other.exponents:
             total[base] = total.get(base, 0) + power * times

@@ -1,14 +1,15 @@
-"""Recordings by ping and irtt as delays of packets.
+"""Recordings of ping and irtt as delays of packets.
 
-Takes: a text. Gives: `Probe`, `read_probe`; None for a text that is neither.
-Guarantees: one delay a packet, in the order of sending; a packet without an answer is lost. The result agrees
-with the statistics at the end of the recording, or the recording is refused. Both programs record round trips
-only (one-way delays of irtt need two equal clocks): half of each is the delay, and a remark states it.
-Does not: quote the file, which may be private.
+Takes: a text. Gives: `Probe`, `read_probe`; None for other texts.
+Guarantees: one delay per packet, in the order of sending; a packet without an answer is lost. The result
+agrees with the statistics at the end of the recording, or an error is raised. Both programs record round
+trips only (one-way delays of irtt require synchronized clocks): half of each is the delay, and a remark
+states this.
+Does not: print text of the file, which may be private.
 
-ping is that of iputils in any of its languages, of BusyBox, Toybox, BSD and macOS (`icmp_seq=7 … time=12.3
-ms`), which number packets, or of Windows in any language, which has one line a packet between its heading and
-a blank line; irtt is the file of `irtt client -o FILE`.
+Supported are ping of iputils in all its languages, of BusyBox, Toybox, BSD and macOS (`icmp_seq=7 … time=12.3
+ms`), which number packets, and of Windows in all languages, which prints one line per packet between a
+heading and a blank line; and the files of `irtt client -o FILE`.
 """
 
 from __future__ import annotations
@@ -27,35 +28,35 @@ from apc.compiler.errors import ApcError, SourceLocation
 from apc.compiler.source.reading import fault
 
 HALVED = (
-    "round trips were recorded: half of each stands for one way, as if both took as long, and a packet "
-    "lost on either way counts as lost"
+    "recorded round trips: half of each is used as the delay of one direction, and a packet lost in either "
+    "direction counts as lost"
 )
-LATEST_DELAY = 1e9  # seconds: a longer one is no packet's, and its square would leave the range of floats
+LATEST_DELAY = 1e9  # seconds: the square of a much longer delay would exceed the range of floats
 _LINE_END = re.compile("\r\n|\n|\r")
-# Spaces are those of any language: French has no-break ones before a unit. U+FFFD is one in a code page.
+# Spaces of all languages: French has no-break spaces before a unit, decoded from a code page as U+FFFD.
 _MS = "ms|мс|ミリ秒|毫秒|밀리초|მწმ|mts"
 _TIME = rf"[=<][\s\ufffd]?(?P<time>\d{{1,15}}(?:[.,]\d{{1,15}})?)[\s\ufffd]?(?P<unit>{_MS}|us|µs|s)(?!\w)"
 _TOOK = re.compile(rf"\w\s?{_TIME}")
 _NUMBER = re.compile(r"\b(?:icmp?_s(?:eq|ql)|seq|pořadí)\s?[= ]\s?(?P<number>\d{1,18})(?!\d)")
 _ANSWERED = re.compile(r"\b(?:ttl|hlim)\s?=\s?\d", re.IGNORECASE)
-_DUPLICATE = re.compile(r"\([^()\d]*[!！]\)|DUP")  # the second of two answers
+_DUPLICATE = re.compile(r"\([^()\d]*[!！]\)|DUP")  # a second answer to the same packet
 _STAMP = re.compile(r"\[(?P<stamp>\d{1,15}\.\d{1,15})\] ")
 _HEADING = re.compile(r"(?:PING6?|ПІНГ)[ (]|Ping \S+ \(\S+\):")
 _FROM_ZERO = re.compile(
     r"PING6?\b.*(?:: (?:\d+|\(.*\)) data bytes| --> )"
-)  # these programs begin to count at 0
-# A run that was stopped within a line, and the heading of the next one behind it.
+)  # programs that number packets from 0
+# A run that ended within a line, followed by the heading of the next run.
 _CUT_HEADING = re.compile(r".+?PING6? \S+ \(\S+\).*\d+(?:\(\d+\))? (?:data )?bytes")
 _TCPING = re.compile(r"Probing \S+:\d+/tcp")
 _PARTS = re.compile(r"[,，](?!\d)")
 _TOTAL = re.compile(rf"(?<![\d.,-])(?P<total>\d{{1,15}})\s?(?:{_MS})\W*\Z")
 _WINDOWS = re.compile(rf"\w\s?{_TIME}(?:\s*TTL=\d+)?\s*\Z")
 _WINDOWS_STATISTICS = re.compile(r"\s.*?" + r"=\s?(\d{1,9})(?=[\s,，、(]|\Z)[^=]*" * 3)
-_WRAPS = 1 << 16  # a packet's number has 16 bits
-_SECONDS = {"us": 1e-6, "µs": 1e-6, "s": 1.0}  # any other unit is a word for milliseconds
-# Of numbers that leave a gap: what one line may claim to be lost.
+_WRAPS = 1 << 16  # the number of a packet has 16 bits
+_SECONDS = {"us": 1e-6, "µs": 1e-6, "s": 1.0}  # the other units are words for milliseconds
+# The largest number of packets lost between two consecutive lines.
 _LONGEST_GAP = 1 << 15
-# A step of the clock further from the usual one, in usual steps, is that of a clock that was set.
+# A larger deviation of a time step from the median step, relative to it, is attributed to a clock adjustment.
 _STEADY = 10.0
 
 
@@ -63,8 +64,7 @@ _STEADY = 10.0
 class Probe:
     """Packets sent at a fixed interval, recorded by a `program`.
 
-    `delays` (n,) in seconds, infinite for a packet that was lost; `interval` in seconds, above 0, NaN where
-    it is not known.
+    `delays` (n,) in seconds, infinite for a lost packet; `interval` > 0 in seconds, NaN if unknown.
     """
 
     program: str
@@ -73,13 +73,13 @@ class Probe:
 
 
 def read_probe(text: str, file: str = "") -> Probe | None:
-    """Return the packets recorded by ping or irtt; None of another text, or one without packets.
+    """Return the packets recorded by ping or irtt; None for another text, or one without packets.
 
     Raises
     ------
     ApcError
-        E704 the recording holds two runs, an answer without a readable time, or other numbers of packets than
-        its statistics.
+        E704 the recording has two runs, an answer without a readable time, or numbers of packets that differ
+        from its statistics.
     """
     if text.lstrip()[:1] == "{":
         return _irtt(text, SourceLocation(file))
@@ -88,14 +88,18 @@ def read_probe(text: str, file: str = "") -> Probe | None:
 
 
 def _irtt(text: str, location: SourceLocation) -> Probe | None:
+    """Return the packets of a JSON file of irtt; None for other texts.
+
+    Raises ApcError if its statistics differ.
+    """
     try:
-        written = json.loads(text)
-        trips = {int(item["seqno"]): _round_trip(item) for item in written["round_trips"]}
-        interval = float(written["config"]["params"]["interval"]) * 1e-9
-        statistics = written.get("stats") or {}
+        document = json.loads(text)
+        trips = {int(item["seqno"]): _round_trip(item) for item in document["round_trips"]}
+        interval = float(document["config"]["params"]["interval"]) * 1e-9
+        statistics = document.get("stats") or {}
         expected = {
-            name: float(statistics[key]) - float(statistics.get(less, 0))
-            for name, key, less in (
+            name: float(statistics[key]) - float(statistics.get(subtracted_key, 0))
+            for name, key, subtracted_key in (
                 ("packets", "packets_sent", ""),
                 ("answers", "packets_received", "duplicates"),
             )
@@ -110,98 +114,113 @@ def _irtt(text: str, location: SourceLocation) -> Probe | None:
         or any(map(math.isnan, trips.values()))
     ):
         return None
-    counted = {"packets": len(written["round_trips"]), "answers": _answers(trips)}
+    counted = {"packets": len(document["round_trips"]), "answers": _answers(trips)}
     for name, number in expected.items():
         if number != counted[name]:
             raise _disagreement(name, number, counted[name], location)
-    delays = _in_order(trips, 0, max(trips))
+    delays = _one_way_delays(trips, 0, max(trips))
     return Probe("irtt", delays, interval if 0 < interval <= LATEST_DELAY else math.nan)
 
 
 def _round_trip(item: dict[str, Any]) -> float:
-    """Return a round trip of irtt in seconds, less the time at the server; infinite if it was lost."""
+    """Return a round-trip time of irtt in seconds, without the time at the server.
+
+    The result is infinite for a lost packet, NaN if it is invalid.
+    """
     if item["lost"] is not False and item["lost"] != "false":
         return math.inf
-    took = float(item["delay"]["rtt"]) * 1e-9
-    return took if 0 <= took <= LATEST_DELAY else math.nan
+    seconds = float(item["delay"]["rtt"]) * 1e-9
+    return seconds if 0 <= seconds <= LATEST_DELAY else math.nan
 
 
 def _ping(lines: Sequence[str], file: str) -> Probe | None:
-    """Read a ping that numbers packets."""
-    trips: dict[int, float] = {}
-    stamps: list[tuple[int, float]] = []
+    """Return the packets of a run of ping whose lines have packet numbers; None for other texts.
+
+    `lines` are those of the recording, `file` its name for messages. Raises ApcError (E704) as `read_probe`.
+    """
+    round_trips: dict[int, float] = {}  # by packet number, in seconds; infinite without an answer
+    sending_times: list[tuple[int, float]] = []  # packet number and time in seconds
     statistics: tuple[float, float, float] | None = None
-    turns, last, first, headed = 0, 0, 1, False
-    ended = SourceLocation(file)
-    for at, line in enumerate(lines, start=1):
-        counted = _NUMBER.search(line)
-        if counted is not None and at == len(lines) and counted.end() == len(line):
+    # The number of wraparounds of the 16-bit packet number, and the largest and the first packet number.
+    wraparounds, largest, first_number, has_heading = 0, 0, 1, False
+    statistics_location = SourceLocation(file)
+    for line_number, line in enumerate(lines, start=1):
+        number_match = _NUMBER.search(line)
+        if number_match is not None and line_number == len(lines) and number_match.end() == len(line):
             break  # the recording ends within a number
-        if counted is None:
+        if number_match is None:
             if _CUT_HEADING.match(line):
-                raise _second_run(SourceLocation(file, at, 1))
+                raise _second_run(SourceLocation(file, line_number, 1))
             if _HEADING.match(line):
-                if headed or trips or statistics:
-                    raise _second_run(SourceLocation(file, at, 1))
-                headed, first = True, 0 if _FROM_ZERO.match(line) else 1
-            elif not (headed or trips):
-                continue  # no line of a ping yet
+                if has_heading or round_trips or statistics:
+                    raise _second_run(SourceLocation(file, line_number, 1))
+                has_heading, first_number = True, 0 if _FROM_ZERO.match(line) else 1
+            elif not (has_heading or round_trips):
+                continue  # text before the recording
             elif (result := _statistics(line)) is not None:
                 if statistics:
-                    raise _second_run(SourceLocation(file, at, 1))
-                statistics, ended = result, SourceLocation(file, at, 1)
-            elif line.startswith("--") and statistics is None and _unread(lines[at : at + 1]):
+                    raise _second_run(SourceLocation(file, line_number, 1))
+                statistics, statistics_location = result, SourceLocation(file, line_number, 1)
+            elif (
+                line.startswith("--") and statistics is None and _unread(lines[line_number : line_number + 1])
+            ):
                 expected = "numbers of packets sent, received and lost"
                 raise fault(
-                    "E704", SourceLocation(file, at + 1, 1), "the statistics of a recording", expected
+                    "E704",
+                    SourceLocation(file, line_number + 1, 1),
+                    "statistics of the recording",
+                    expected,
                 )
             elif "TTL=" in line and _windows_answer(line):
-                raise _second_run(SourceLocation(file, at, 1))
+                raise _second_run(SourceLocation(file, line_number, 1))
             continue
         if statistics:
-            raise _second_run(SourceLocation(file, at, 1))
-        number = int(counted["number"]) + turns * _WRAPS
-        if trips and number < last - _WRAPS // 2:  # the count of packets has begun again
-            turns, number = turns + 1, number + _WRAPS
-        if abs(number - last) > _LONGEST_GAP:
-            expected = f"at most {_LONGEST_GAP} away from the one before"
-            raise fault("E704", SourceLocation(file, at, 1), "the number of a packet", expected)
-        last = max(last, number)
-        took = _TOOK.search(line)
-        if took is None:
+            raise _second_run(SourceLocation(file, line_number, 1))
+        number = int(number_match["number"]) + wraparounds * _WRAPS
+        if round_trips and number < largest - _WRAPS // 2:  # the 16-bit number of packets has wrapped around
+            wraparounds, number = wraparounds + 1, number + _WRAPS
+        if abs(number - largest) > _LONGEST_GAP:
+            expected = f"at most {_LONGEST_GAP} from the previous one"
+            raise fault("E704", SourceLocation(file, line_number, 1), "packet number", expected)
+        largest = max(largest, number)
+        time_match = _TOOK.search(line)
+        if time_match is None:
             if _ANSWERED.search(line):
-                if at == len(lines):  # the recording ends within this line
+                if line_number == len(lines):  # the recording ends within this line
                     break
-                raise _untimed(SourceLocation(file, at, 1))
-            trips.setdefault(number, math.inf)  # no answer yet: one may come
-        elif math.isinf(trips.get(number, math.inf)):
-            trips[number] = _seconds(took, file, at)
+                raise _untimed(SourceLocation(file, line_number, 1))
+            round_trips.setdefault(number, math.inf)  # an answer may follow
+        elif math.isinf(round_trips.get(number, math.inf)):
+            round_trips[number] = _seconds(time_match, file, line_number)
             if (stamp := _STAMP.match(line)) is not None:
-                stamps.append((number, float(stamp["stamp"]) - trips[number]))
-        elif number < last and not _DUPLICATE.search(line):
-            raise _second_run(SourceLocation(file, at, 1))
-    first = min(first, *trips) if trips else first
-    final = max(trips, default=first - 1)
-    total = math.nan
+                sending_times.append((number, float(stamp["stamp"]) - round_trips[number]))
+        elif number < largest and not _DUPLICATE.search(line):
+            raise _second_run(SourceLocation(file, line_number, 1))
+    first_number = min(first_number, *round_trips) if round_trips else first_number
+    last_number = max(round_trips, default=first_number - 1)
+    duration = math.nan
     if statistics is not None:
-        sent, received, total = statistics
-        if received != _answers(trips):
-            raise _disagreement("answers", received, _answers(trips), ended)
-        if not 0 <= sent - (final - first + 1) <= _LONGEST_GAP:
-            raise _disagreement("packets", sent, final - first + 1, ended)
-        final = first + int(sent) - 1
-    if final < first:
+        sent, received, duration = statistics
+        if received != _answers(round_trips):
+            raise _disagreement("answers", received, _answers(round_trips), statistics_location)
+        if not 0 <= sent - (last_number - first_number + 1) <= _LONGEST_GAP:
+            raise _disagreement("packets", sent, last_number - first_number + 1, statistics_location)
+        last_number = first_number + int(sent) - 1
+    if last_number < first_number:
         return None
-    interval = _steady_step(stamps)
-    if math.isnan(interval) and final > first and total > 0:
-        interval = total / (final - first)
-    return Probe("ping", _in_order(trips, first, final), interval)
+    interval = _steady_step(sending_times)
+    if math.isnan(interval) and last_number > first_number and duration > 0:
+        interval = duration / (last_number - first_number)
+    return Probe("ping", _one_way_delays(round_trips, first_number, last_number), interval)
 
 
 def _statistics(line: str) -> tuple[float, float, float] | None:
-    """Return packets sent and received, and the seconds it took (NaN if unknown), of a line of statistics.
+    """Return the packets sent and received and the duration in seconds, from a line of statistics.
 
-    In any language these are the first two of its parts between commas, and a later one is a percentage.
+    The result is None for other lines.
+
+    In all languages the numbers are in the first two parts between commas, and a later part is a percentage.
+    The duration is NaN if unknown.
     """
     parts = _PARTS.split(line)
     if len(parts) < 3 or "=" in line or not any("%" in part for part in parts[2:]):
@@ -215,12 +234,15 @@ def _statistics(line: str) -> tuple[float, float, float] | None:
 
 
 def _unread(following: Sequence[str]) -> bool:
-    """Return whether the line below the heading of the statistics is not the statistics."""
+    """Return whether the line below the heading of the statistics has no valid statistics."""
     return any(line.strip() and _statistics(line) is None for line in following)
 
 
 def _steady_step(stamps: Sequence[tuple[int, float]]) -> float:
-    """Return the mean time between packets, without the steps of a clock that was set; NaN if unknown."""
+    """Return the mean time between packets in seconds, NaN if unknown; clock adjustments are excluded.
+
+    `stamps` are the number and the sending time of each packet.
+    """
     if len(stamps) < 2:
         return math.nan
     numbers, times = np.array(sorted(stamps)).T
@@ -235,33 +257,42 @@ def _steady_step(stamps: Sequence[tuple[int, float]]) -> float:
 
 
 def _windows_ping(lines: Sequence[str], file: str) -> Probe | None:
-    """Read a ping without numbers: each line between its heading and a blank line is the next packet."""
+    """Return the packets of a ping without packet numbers; None for other texts. Raises ApcError (E704).
+
+    Each line between the heading and a blank line is the next packet.
+    """
     trips: list[float] = []
     statistics: tuple[int, ...] | None = None
-    ended, repeated, replies = SourceLocation(file), None, 0
-    headed = inside = False
-    for at, line in enumerate(lines, start=1):
+    statistics_location, repeated, replies = SourceLocation(file), None, 0
+    after_heading = in_packets = False
+    for line_number, line in enumerate(lines, start=1):
         if _TCPING.match(line):
             return None
-        if inside and line[:1].isspace() and line.strip():
-            continue  # routes and time stamps of the answer above
+        if in_packets and line[:1].isspace() and line.strip():
+            continue  # routes and time stamps of the preceding answer
         if not line.strip() or line[0].isspace():
             if statistics is None and (result := _WINDOWS_STATISTICS.match(line)):
-                statistics, ended = tuple(map(int, result.groups())), SourceLocation(file, at, 1)
-            headed = headed and not line.strip()  # the heading of statistics has indented lines below it
-            inside = False
+                statistics, statistics_location = (
+                    tuple(map(int, result.groups())),
+                    SourceLocation(file, line_number, 1),
+                )
+            # The heading of statistics has indented lines below it.
+            after_heading = after_heading and not line.strip()
+            in_packets = False
         elif line.rstrip().endswith((":", "：")):
-            headed, inside = True, False
+            after_heading, in_packets = True, False
         else:
-            took = _windows_answer(line)
-            if headed and trips:
-                repeated = repeated or SourceLocation(file, at, 1)
-            inside, headed = inside or headed or took is not None, False
-            if took is not None:
-                trips.append(_seconds(took, file, at))
-            elif inside and (at < len(lines) or line.endswith((".", "。"))):  # not cut within this line
+            time_match = _windows_answer(line)
+            if after_heading and trips:
+                repeated = repeated or SourceLocation(file, line_number, 1)
+            in_packets, after_heading = in_packets or after_heading or time_match is not None, False
+            if time_match is not None:
+                trips.append(_seconds(time_match, file, line_number))
+            elif in_packets and (
+                line_number < len(lines) or line.endswith((".", "。"))
+            ):  # the last line may be incomplete
                 if _ANSWERED.search(line):
-                    raise _untimed(SourceLocation(file, at, 1))
+                    raise _untimed(SourceLocation(file, line_number, 1))
                 trips.append(math.inf)
                 replies += ":" in line
     if not np.isfinite(trips).any() and (statistics is None or not trips):
@@ -272,46 +303,53 @@ def _windows_ping(lines: Sequence[str], file: str) -> Probe | None:
         sent, received, _ = statistics
         answers = int(np.isfinite(trips).sum())
         if sent != len(trips):
-            raise _disagreement("packets", sent, len(trips), ended)
+            raise _disagreement("packets", sent, len(trips), statistics_location)
         # Windows counts a reply such as "Destination host unreachable" as received.
         if not answers <= received <= answers + replies:
-            raise _disagreement("answers", received, answers, ended)
+            raise _disagreement("answers", received, answers, statistics_location)
     return Probe("ping", np.array(trips) / 2, math.nan)
 
 
 def _windows_answer(line: str) -> re.Match[str] | None:
-    """Return the time in an answer, which follows the address and a colon."""
+    """Return the match of the time in an answer, after the address and a colon; None for other lines."""
     return _WINDOWS.search(line) if ":" in line or "：" in line else None
 
 
-def _seconds(took: re.Match[str], file: str, line: int) -> float:
-    """Return the time of an answer in seconds. Raises ApcError of a time no packet takes."""
-    seconds = float(took["time"].replace(",", ".")) * _SECONDS.get(took["unit"], 1e-3)
+def _seconds(time_match: re.Match[str], file: str, line: int) -> float:
+    """Return the time of an answer in seconds. Raises ApcError if it exceeds `LATEST_DELAY`."""
+    seconds = float(time_match["time"].replace(",", ".")) * _SECONDS.get(time_match["unit"], 1e-3)
     if seconds > LATEST_DELAY:
         raise _untimed(SourceLocation(file, line, 1))
     return seconds
 
 
 def _answers(trips: dict[int, float]) -> int:
+    """Return the number of packets with an answer."""
     return sum(map(math.isfinite, trips.values()))
 
 
 def _second_run(location: SourceLocation) -> ApcError:
-    return fault("E704", location, "a recording", "one run of ping", "a second run from this line on")
+    """Return the error E704 for a recording with a second run."""
+    return fault("E704", location, "recording", "one run of ping", "a second run that starts in this line")
 
 
 def _untimed(location: SourceLocation) -> ApcError:
+    """Return the error E704 for an answer without a valid time."""
     expected = f"a round trip of at most {LATEST_DELAY:.0e} s, such as time=12.3 ms"
-    return fault("E704", location, "an answer", expected)
+    return fault("E704", location, "reply", expected)
 
 
 def _disagreement(subject: str, expected: float, got: int, location: SourceLocation) -> ApcError:
+    """Return the error E704 for a number of packets or answers that differs from the statistics."""
     of_statistics = f"{expected:.12g}, as in its statistics"
-    return fault("E704", location, f"the number of {subject} in a recording", of_statistics, str(got))
+    return fault("E704", location, f"number of {subject} in the recording", of_statistics, str(got))
 
 
-def _in_order(trips: dict[int, float], first: int, last: int) -> NDArray[np.float64]:
-    """Return half of each round trip, by number; infinite where there is none."""
+def _one_way_delays(trips: dict[int, float], first: int, last: int) -> NDArray[np.float64]:
+    """Return half of each round-trip time, by packet number from `first` to `last`.
+
+    The delay is infinite for a lost packet.
+    """
     delays = np.full(last - first + 1, math.inf)
     if trips:
         delays[np.array(list(trips)) - first] = np.array(list(trips.values())) / 2

@@ -3,7 +3,7 @@
 Takes: a path. Gives: `read_time_table`, a `TimeTable`; `read_trace`, a `Trace`; both in SI.
 Guarantees: times increase; a delay is 0 or more, or marks a lost packet; an error names its file, line and
 column.
-Does not: interpret them.
+Does not: interpret recordings.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from apc.compiler.number_parsing import plain_float
 from apc.compiler.source.reading import brief, fault
 
 DELAY = "delay"  # the column of a trace that is read
-TABLE_SUFFIX = ".csv"  # a file of another suffix may be what ping or irtt wrote
-RECORDINGS = "packets as ping or irtt wrote them, or a table with a column delay [ms]"
-LOST = "lost"  # a packet that never arrived, in a trace; so is a cell with nothing in it
+TABLE_SUFFIX = ".csv"  # a file with another suffix may be output of ping or irtt
+RECORDINGS = "the output of ping or irtt, or a table with a column delay [ms]"
+LOST = "lost"  # the text of a lost packet in a trace; an empty cell has the same meaning
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TimeTable:
-    """A quantity over time: `times` (n,) in seconds, rising; `numbers` (n,) in SI."""
+    """A time series of a quantity: increasing `times` (n,) in seconds; `numbers` (n,) in SI units."""
 
     name: str
     times: NDArray[np.float64]
@@ -40,7 +40,7 @@ class TimeTable:
 
 
 def read_time_table(path: Path, name: str, unit: Unit, named_at: SourceLocation) -> TimeTable:
-    """Read a quantity over time: two columns, time and the quantity, and two or more rows of rising time.
+    """Return the time series in a CSV file with two columns, time and the quantity, and at least two rows.
 
     Parameters
     ----------
@@ -54,28 +54,28 @@ def read_time_table(path: Path, name: str, unit: Unit, named_at: SourceLocation)
     Raises
     ------
     ApcError
-        As `read_table`, and when the columns or times are not as they must be.
+        As `read_table`; E702 other columns or units, E703 fewer than two rows, or times that do not increase.
     """
     table = read_table(path, named_at)
     first = table.columns[0]
     if len(table.columns) != 2 or first.unit.dimension != SECOND:
         expected = f"two columns, time [s] and {name} [{unit.text}]"
-        raise fault("E702", first.location, "a table over time", expected)
+        raise fault("E702", first.location, "table over time", expected)
     times, numbers = table.columns
     if numbers.unit.dimension != unit.dimension:
         raise fault("E702", numbers.location, brief(numbers.name), unit.text, numbers.unit.text)
     if table.rows < 2 or not (np.diff(times.numbers) > 0).all():
-        expected = "two or more rows of rising time"
-        raise fault("E703", times.location, "a table over time", expected)
+        expected = "two or more rows with increasing time"
+        raise fault("E703", times.location, "table over time", expected)
     return TimeTable(name, times.numbers, numbers.numbers)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trace:
-    """Recorded one-way delays: `delays` (n,) in seconds, one per packet, infinite for a lost one.
+    """Recorded one-way delays: `delays` (n,) in seconds, one per packet, infinite for a lost packet.
 
-    `program` wrote the file, "" for a table; `interval` is the sending interval in seconds, NaN if the file
-    does not contain it.
+    `program` is the program that recorded the packets, "" for a table; `interval` is the sending interval in
+    seconds, NaN if the file does not contain it.
     """
 
     delays: NDArray[np.float64]
@@ -84,10 +84,10 @@ class Trace:
 
 
 def read_trace(path: Path, named_at: SourceLocation) -> Trace:
-    """Read the column `delay` of a CSV file: 0 or more per packet; `lost`, or empty, if it was lost.
+    """Return the delays of packets from the column `delay` of a CSV file, or from output of ping or irtt.
 
-    Other columns are ignored. An empty line is not a packet. Output of ping or irtt is read by
-    `ping_recordings`.
+    A cell is a delay of 0 or more, or `lost` or empty for a lost packet. Other columns are ignored. An empty
+    line is not a packet. Output of ping or irtt is read by `ping_recordings`.
 
     Parameters
     ----------
@@ -99,23 +99,27 @@ def read_trace(path: Path, named_at: SourceLocation) -> Trace:
     Raises
     ------
     ApcError
-        E701 it cannot be read, E702 there is no column `delay` in a unit of time, E703 a row or cell is
-        invalid, or there is none; E704 a recording of ping or irtt contradicts itself, or holds two runs.
+        E701 the file cannot be read, E702 there is no column `delay` in a unit of time, E703 a row or cell is
+        invalid, or there is no row; E704 a recording of ping or irtt is inconsistent, or has two runs.
     """
     if path.suffix.lower() != TABLE_SUFFIX:
         data = read_bytes(path, named_at, any_text=True)
-        # Windows writes UTF-16 from PowerShell, else a code page, in which the digits are those of ASCII.
+        # Windows writes UTF-16 from PowerShell, else a code page in which digits are encoded as in ASCII.
         encoding = "utf-16" if data[:2] in (BOM_UTF16_LE, BOM_UTF16_BE) else "utf-8-sig"
         text = data.decode(encoding, "replace")
         if (probe := read_probe(text, str(path))) is not None:
             return Trace(probe.delays, probe.program, probe.interval)
         if DELAY not in text.partition("\n")[0]:
-            raise fault("E702", SourceLocation(str(path), 1, 1), "a recording", RECORDINGS)
-    with open_table(path, named_at, known=(DELAY,)) as opened:
+            raise fault("E702", SourceLocation(str(path), 1, 1), "recording", RECORDINGS)
+    with open_table(path, named_at, known=(DELAY,), example="delay [ms]") as opened:
         column = _delay_column(opened.headings)
         scale = float(opened.headings[column][1].scale)
 
         def delay(cell: str) -> float:
+            """Return the delay in a cell in seconds, infinite for a lost packet.
+
+            Raises ValueError for other texts.
+            """
             if cell.strip() in ("", LOST):
                 return math.inf
             seconds = plain_float(cell) * scale
@@ -123,18 +127,19 @@ def read_trace(path: Path, named_at: SourceLocation) -> Trace:
                 raise ValueError("no time of a packet")
             return seconds
 
-        expected = f"a time from 0 to {LATEST_DELAY:.0e} s, or {LOST}"
-        delays, _ = opened.numbers([column], [delay], "a delay", expected, empty_too=True)
+        expected = f"a time from 0 to {LATEST_DELAY:.0e} s, or the word {LOST}"
+        delays, _ = opened.numbers([column], [delay], "delay", expected, empty_too=True)
     return Trace(delays)
 
 
 def _delay_column(names: Headings) -> int:
     """Return the index of the column named delay."""
-    got, location = ", ".join(name for name, _, _ in names), names[0][2]
+    listed = ", ".join(name for name, _, _ in names)
+    got, location = f"the column{'s' * (len(names) > 1)} {listed}", names[0][2]
     for column, (name, unit, at) in enumerate(names):
         if name == DELAY:
             if unit.dimension == SECOND:
                 return column
             got, location = f"delay {'without a unit' if unit == NO_UNIT else f'in {unit.text}'}", at
     expected = "a column delay in a unit of time"
-    raise fault("E702", location, "a trace", expected, brief(got), "delay [ms]")
+    raise fault("E702", location, "trace", expected, brief(got), "delay [ms]")

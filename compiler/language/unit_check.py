@@ -1,10 +1,10 @@
-"""Units checked through expressions and equations.
+"""Dimension check of expressions and equations.
 
 Takes: `Expr` and `Equation`, and the dimension of every name.
 Gives: `dimension_of`, the dimension of an expression; `check_equation`.
-Guarantees: every term of an expression that does not fit is reported, each once, at its own column; a part
-whose dimension is unknown complains about nothing.
-Does not: know scales (all is SI by now), or look names up.
+Guarantees: every term with a wrong dimension is reported once, at its own column; a part of unknown dimension
+causes no error.
+Does not: handle scales (all numbers are in SI units), or resolve names.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from apc.compiler.language.expression import (
 from apc.compiler.language.unit_text import format_dimension
 
 ANY = Dimension((("any", 1),))
-"""The dimension of the literal 0, which fits every other."""
+"""The dimension of the literal 0, which agrees with every dimension."""
 
 _HALF = NumberLiteral(Fraction(1, 2))
 
@@ -39,14 +39,14 @@ Lookup = Callable[[Name], Dimension | None]
 
 
 def dimension_of(expr: Expr, lookup: Lookup, text: str, location: SourceLocation) -> Dimension | None:
-    """Return the dimension of an expression.
+    """Return the dimension of an expression, after checking the dimensions of all its terms.
 
     Parameters
     ----------
     expr
-        The tree; its offsets count in `text`.
+        The tree; its offsets refer to `text`.
     lookup
-        Returns the dimension of a name, None if unknown.
+        The function that returns the dimension of a name, None if unknown.
     text, location
         The text, and its location.
 
@@ -54,13 +54,13 @@ def dimension_of(expr: Expr, lookup: Lookup, text: str, location: SourceLocation
     -------
     Dimension or None
         `ANY` for a literal 0, `DIMENSIONLESS` for every other literal and for a condition; None if it depends
-        on a name without a dimension. A sum with one known term has that term's.
+        on a name without a dimension. A sum with one term of known dimension has the dimension of this term.
 
     Raises
     ------
     ApcError
-        E402 a term that doesn't fit its sum, E403 an argument that has to be a plain number, E404 branches,
-        arguments or sides of a comparison that differ, E405 a delay that is no time.
+        E402 different dimensions in a sum, E403 an argument that is not dimensionless, E404 different
+        dimensions of branches, arguments or sides of a comparison, E405 a delay that is not a time.
     """
     checker = _Checker(lookup, text, location)
     dimension = checker.dimension(expr)
@@ -71,8 +71,7 @@ def dimension_of(expr: Expr, lookup: Lookup, text: str, location: SourceLocation
 def check_equation(equation: Equation, lookup: Lookup) -> None:
     """Check that both sides of an equation, and all terms in them, have the same dimension.
 
-    The terms of both sides are compared together, so that in `m*der(v) = f - d*x`
-    the one that is wrong is named.
+    The terms of both sides are compared together, so that the wrong term in `m*der(v) = f - d*x` is reported.
 
     Raises
     ------
@@ -85,7 +84,7 @@ def check_equation(equation: Equation, lookup: Lookup) -> None:
 
 
 def _terms(expr: Expr) -> list[Expr]:
-    """Return the operands of a sum, with signs and parentheses resolved."""
+    """Return the terms of a sum, without their signs and parentheses."""
     match expr:
         case Call("+" | "-" | "neg", parts):
             return [term for part in parts for term in _terms(part)]
@@ -93,28 +92,39 @@ def _terms(expr: Expr) -> list[Expr]:
 
 
 def _dimension_text(dimension: Dimension) -> str:
+    """Return the text of a dimension in messages."""
     return "a plain number" if dimension == DIMENSIONLESS else format_dimension(dimension)
 
 
 class _Checker:
-    """Determines dimensions and collects errors; a part with an error is unknown, to report it once."""
+    """The check of one text: returns dimensions and collects errors.
+
+    A part with an error has an unknown dimension.
+    """
 
     def __init__(self, lookup: Lookup, text: str, location: SourceLocation) -> None:
         self.lookup, self.text, self.location = lookup, text, location
         self.mistakes = Mistakes()
 
     def expression_text(self, expr: Expr) -> str:
+        """Return the text of a part of the expression, at most 60 characters."""
         written = as_written(expr, self.text)
         return written if len(written) <= 60 else written[:57] + "…"
 
     def add(self, code: str, expr: Expr, expected: str, got: Dimension) -> None:
+        """Record an error located at a part of the expression, with the dimension of the part."""
         location = location_in(self.location, self.text, expr.start)
         self.mistakes.add(
             code, location, self.expression_text(expr), expected=expected, got=_dimension_text(got)
         )
 
     def agree(self, code: str, parts: Sequence[Expr]) -> Dimension | None:
-        """Return the dimension most parts have, the first of them in a tie; report the others."""
+        """Return the dimension of most parts, the first of them in a tie.
+
+        Record the parts with another dimension.
+
+        The result is `ANY` if all parts are 0, None if no dimension is known.
+        """
         pairs = [(part, self.dimension(part)) for part in parts]
         known = [(part, dimension) for part, dimension in pairs if dimension not in (None, ANY)]
         if not known:
@@ -124,23 +134,26 @@ class _Checker:
         for part, dimension in known:
             if dimension and typical and (dimension != typical or dimension.clashes(typical)):
                 self.add(
-                    code, part, f"{_dimension_text(typical)} like {self.expression_text(like)}", dimension
+                    code,
+                    part,
+                    f"{_dimension_text(typical)}, the unit of {self.expression_text(like)}",
+                    dimension,
                 )
         return typical
 
-    def fits(self, expr: Expr, due: Dimension, code: str, expected: str) -> None:
-        """Report an argument that has to be of one dimension and is not."""
+    def fits(self, expr: Expr, required: Dimension, code: str, expected: str) -> None:
+        """Record an argument whose dimension is not the required one (`required`)."""
         dimension = self.dimension(expr)
-        if dimension is not None and dimension not in (ANY, due):
+        if dimension is not None and dimension not in (ANY, required):
             self.add(code, expr, expected, dimension)
 
     def factor(self, expr: Expr) -> Dimension | None:
-        """Return the dimension of a part of a product, in which a literal 0 is a number like any other."""
+        """Return the dimension of a factor of a product, in which the literal 0 is dimensionless."""
         dimension = self.dimension(expr)
         return DIMENSIONLESS if dimension == ANY else dimension
 
     def dimension(self, expr: Expr) -> Dimension | None:
-        """Return the dimension of an expression; None after an error, ANY for the literal 0."""
+        """Return the dimension of an expression; None after an error, `ANY` for the literal 0."""
         if isinstance(expr, NumberLiteral):
             return DIMENSIONLESS if expr.value else ANY
         if isinstance(expr, Name):
@@ -159,7 +172,8 @@ class _Checker:
             conditions, parts = (parts[:1], parts[1:]) if word == "if" else (parts, ())
             for condition in conditions:
                 self.dimension(condition)
-        # Of the branches, sides or entries of one; atan2: of the sides of a triangle, whatever their unit.
+        # Branches, sides and entries have the same dimension, and so have the arguments of max, min and
+        # atan2.
         equal = word not in FUNCTIONS or word in ("max", "min", "atan2")
         result = self.agree("E404", parts) if equal else self.dimension(parts[0])
         for time in parts[1:] if word in _TIMES else ():
@@ -168,10 +182,11 @@ class _Checker:
             return DIMENSIONLESS
         if word == "der" and result != ANY:
             return result and result.divide(SECOND)
-        # Else of if, {, max, min, hold, interpolate, sample, previous, initial, mean, sum, abs and norm.
+        # The other functions, such as max, hold or sample, have the dimension of their arguments.
         return SECOND if word == "age" else result
 
     def product(self, word: str, left: Expr, right: Expr) -> Dimension | None:
+        """Return the dimension of a product, quotient or power; None if it is unknown."""
         base = self.factor(left)
         if word == "^" and isinstance(right, NumberLiteral):
             return base and base.power(right.value)

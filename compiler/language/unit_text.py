@@ -14,13 +14,13 @@ from apc.compiler.errors import SourceLocation
 from apc.compiler.language.dimensions import Dimension
 from apc.compiler.language.units import Unit, parse_unit
 
-# Units with a name or a usual form, looked up by dimension; the first form of a dimension wins.
+# Usual forms of units, found by dimension; the first form of a dimension is used.
 FORMS = (
     *("1", "kg", "m", "s", "A", "K", "mol", "cd"),
     *("N", "N/m", "N*s/m", "N*s", "N*m", "N/m^2", "N*s^2/m^2", "N*s/m^2", "N*m*s", "N/s", "m/N"),
     *("m/s", "m/s^2", "m/s^3", "m^2", "m^3", "1/s", "1/s^2", "1/m", "W", "V", "N*m/A", "kg*m^2"),
 )
-# How the same units are written where a quantity counts cycles or radians: of each, by its other form.
+# The forms of units for quantities that count cycles (Hz) or radians (rad), by their form without.
 TURNING = {
     "Hz": {"1/s": "Hz"},
     "rad": {"1": "rad", "1/s": "rad/s", "1/s^2": "rad/s^2", "N*m": "N*m/rad", "N*m*s": "N*m*s/rad"},
@@ -28,10 +28,10 @@ TURNING = {
 
 
 def format_dimension(dimension: Dimension) -> str:
-    """Return the dimension as an SI unit `parse_unit` reads: `N*s/m`, `1`, or a product of base units.
+    """Return the text of a dimension as an SI unit: `N*s/m`, `1`, or a product of base units.
 
-    What counts cycles is in Hz, what counts radians in rad, rad/s or rad/s^2; a torque per
-    radian in N*m/rad or N*m*s/rad.
+    A quantity that counts cycles is in Hz, one that counts radians in rad, rad/s or rad/s^2; a torque per
+    radian is in N*m/rad or N*m*s/rad.
     """
     text = _forms().get(dimension)
     if text is None:
@@ -49,12 +49,15 @@ def _forms() -> dict[Dimension, str]:
 
 
 def _powered(base: str, power: Fraction | int) -> str:
+    """Return the text of a power of a base unit."""
     if power == 1:
         return base
     return f"{base}^{power}" if Fraction(power).denominator == 1 else f"{base}^({power})"
 
 
 def format_si(value: float, unit: Dimension | Unit) -> str:
-    """Return an SI value with its SI unit: `500 N/m`; six digits, and no unit for a plain number."""
+    """Return the text of an SI value with its unit, such as `500 N/m`: six digits, no unit if
+    dimensionless.
+    """
     text = format_dimension(unit.dimension if isinstance(unit, Unit) else unit)
     return f"{value:.6g}" if text == "1" else f"{value:.6g} {text}"

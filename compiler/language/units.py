@@ -3,20 +3,23 @@
 Takes: a text (`N*s/m`, `500 N/m`), and its location. Gives: `Unit`, `Quantity`; `parse_unit`,
 `parse_quantity`, and `quantity`, which must match a unit; `COMMON`.
 Guarantees: values are exact rationals (0.1 kg is 1/10, an angle in degrees uses π to 50 digits); the cost of
-a text is bounded; a unit that is not in units.txt, such as the grain, is not accepted.
-Does not: define units of parameters, or check expressions (see `unit_check`).
+parsing is bounded; a unit that is not in units.txt, such as the grain, is not accepted.
+Does not: determine the units of parameters, or check expressions (see `unit_check`).
 
-A quantity is `number ["/" number] [unit]`; unit.lark is the grammar of a unit, Pint defines its names.
+A quantity is `number ["/" number] [unit]`; unit.lark is the grammar of a unit, Pint defines the names of
+units.
 """
 
 from __future__ import annotations
 
 import math
 import re
+import unicodedata
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cache, lru_cache
+from itertools import product
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -42,8 +45,9 @@ from apc.compiler.wording import cut
 TURN = 2 * PI  # a cycle in radians
 MAX_LENGTH = 200  # characters of a quantity
 MAX_EXPONENT = 9  # of a unit: m^9
+MOST_CASED = 6  # names of a unit that are compared with the common ones in another case
 
-# Common units: suggested for a misspelt name, and distinguished by case.
+# Common units, which are proposed for a misspelled name or a name in the wrong case.
 COMMON = (
     "N",
     "mN",
@@ -99,7 +103,7 @@ _BASES = {
     "[luminosity]": "cd",
 }
 _ANGLES = ("radian", "degree", "arcminute", "arcsecond", "turn", "_per_minute", "_per_second")
-_LONG = ("hecto", "kilo", "mega", "giga", "tera")  # no prefix of a second
+_LONG = ("hecto", "kilo", "mega", "giga", "tera")  # prefixes that are invalid for the second
 NAME = re.compile(r"[^\W\d_²³][^\W²³]*|[%°]")  # as in the grammar
 _NUMBER = r"(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
 _QUANTITY_START = re.compile(rf"\s*[+-]?{_NUMBER}(?:\s*/\s*{_NUMBER})?")
@@ -109,7 +113,7 @@ _NOT_FINITE = re.compile(r"[+-]?\.?(nan|inf|infinity)\b", re.IGNORECASE)
 
 @dataclass(frozen=True, slots=True)
 class Unit:
-    """A unit as written; a value in it times `scale` is the value in SI."""
+    """A unit as written; the value in SI units is the value in this unit times `scale`."""
 
     text: str
     scale: Fraction
@@ -118,7 +122,10 @@ class Unit:
 
 @dataclass(frozen=True, slots=True)
 class Quantity:
-    """`value` in SI; `unit` as written, `NO_UNIT` when there was none; `number` as written, without it."""
+    """A quantity: `value` in SI units, `unit` as written, and `number`, the text of the number.
+
+    `unit` is `NO_UNIT` if there is none.
+    """
 
     value: Fraction
     unit: Unit
@@ -129,12 +136,12 @@ NO_UNIT = Unit("1", Fraction(1), DIMENSIONLESS)
 
 
 def parse_unit(text: str, location: SourceLocation) -> Unit:
-    """Read a unit; `1` is the unit of a plain number.
+    """Return the unit of a text; `1` is the unit of a plain number.
 
     Raises
     ------
     ApcError
-        E222 not the text of a unit, E223 no such unit, E224 a unit with an offset or a logarithm,
+        E222 a text that is not a unit, E223 an unknown unit, E224 a unit with an offset or a logarithm,
         E225 an exponent or scale that is too large.
     """
     with placing(text, location):
@@ -142,12 +149,12 @@ def parse_unit(text: str, location: SourceLocation) -> Unit:
 
 
 def parse_quantity(text: str, location: SourceLocation) -> Quantity:
-    """Read a number and its unit, if it has one.
+    """Return the quantity of a text: a number with or without a unit.
 
     Raises
     ------
     ApcError
-        E221 not the text of a quantity, E226 a number that is too large; and those of `parse_unit`.
+        E221 a text that is not a quantity, E226 a number that is too large; and the errors of `parse_unit`.
     """
     with placing(text, location):
         return _quantity(text)
@@ -162,18 +169,18 @@ def quantity(
     before: str | None = None,
     one_fix: bool = False,
 ) -> Quantity:
-    """Read a quantity that must match a unit.
+    """Return the quantity of a text, whose unit must have the dimension of a given unit.
 
     Parameters
     ----------
     text
         The quantity as written.
     location
-        Its location.
+        The location of the text.
     subject
-        Its name, for messages.
+        The name of the quantity, for messages.
     unit
-        A valid unit; `1` for a plain number.
+        A unit of the required dimension; `1` for a plain number.
     before
         Text before the value in a fix; the name and a colon by default.
     one_fix
@@ -182,26 +189,47 @@ def quantity(
     Raises
     ------
     ApcError
-        E204 a unit that does not fit, or none; and those of `parse_quantity`.
+        E204 a wrong or missing unit; and the errors of `parse_quantity`.
     """
     requested = parse_unit(unit, location)
     named = "a plain number" if unit == "1" else unit
-    before = f"{subject}: " if before is None else before
+    if before is None:  # an entry of a list, such as x[2], has no key of its own
+        before = "" if subject.endswith("]") else f"{subject}: "
     try:
         parsed = parse_quantity(text, location)
     except ApcError as error:
         [mistake] = error.mistakes
-        alone = not set("*/^") & set(text)  # it is all there is of the unit
-        if mistake.code == "E223" and mistake.hint:
-            meant = unit if alone and not _is_of(mistake.hint, requested.dimension) else mistake.hint
-            if not location.line:  # of an option, whose value is written anew
-                meant = f"{before}{text.strip().replace(mistake.subject, meant)}"
-            raise ApcError(replace(mistake, hint=meant)) from None
-        if mistake.code != "E221" or mistake.hint:
-            raise
-        example = f"{before}1 {unit}".removesuffix(" 1")
+        single_name = not set("*/^") & set(text)  # the unit is a single name
+        if single_name and "; supported: " in mistake.message:
+            message, _, supported = mistake.message.partition("; supported: ")
+            if not _is_of(supported.partition(",")[0], requested.dimension):  # of another quantity
+                mistake = replace(mistake, message=message, expected=named)
+                error = ApcError(mistake)
+        if mistake.code in ("E223", "E224"):
+            if cased := _in_usual_case(text, requested.dimension):
+                names = zip(NAME.findall(text), NAME.findall(cased), strict=True)
+                changed = [new for old, new in names if old != new]
+                if location.line and len(changed) == 1:
+                    raise ApcError(replace(mistake, fix=changed[0])) from None
+                raise ApcError(replace(mistake, location=location, fix=f"{before}{cased}")) from None
+            if cased := _in_usual_case(text, requested.dimension.power(-1)):  # a rate instead of a time
+                try:
+                    quantity(cased, location, subject=subject, unit=unit, before=before, one_fix=one_fix)
+                except ApcError as reciprocal:
+                    fix = reciprocal.mistakes[0].fix
+                    raise ApcError(replace(mistake, location=location, fix=fix)) from None
+        if mistake.code in ("E223", "E224") and mistake.fix:
+            fix = unit if single_name and not _is_of(mistake.fix, requested.dimension) else mistake.fix
+            if not location.line:  # a command-line option: the fix is the entire value
+                fix = f"{before}{text.strip().replace(mistake.subject, fix)}"
+            raise ApcError(replace(mistake, fix=fix)) from None
+        if mistake.code != "E221" or mistake.fix:
+            raise error from None
+        example, got = f"{before}1 {unit}".removesuffix(" 1"), cut(text) or "nothing"
         raise ApcError(
-            Diagnostic("E221", location, subject, named, cut(text) or "nothing", example)
+            Diagnostic(
+                "E221", location, subject, _finite_number(named, text), cut(text) or "nothing", example
+            )
         ) from None
     actual, due = parsed.unit.dimension, requested.dimension
     got, right = cut(text.strip()), unit
@@ -212,26 +240,59 @@ def quantity(
         turns = TURN if due.turning == "rad" else 1 / TURN
         same = f"{float(parsed.value * turns / requested.scale):.9g} {unit}"
         got += f", which is {same}"
-        hint = f"{before}{same}" + f", or {before}{parsed.number} {unit}" * (not one_fix)
+        fix = f"{before}{same}" + f", or {before}{parsed.number} {unit}" * (not one_fix)
     else:
         if parsed.unit == NO_UNIT:
             got += " (no unit)"
         else:
-            right, slip = _meant(parsed.unit, requested)
+            right, slip = _corrected_unit(parsed.unit, requested)
             got += f" ({slip} is {_long_name(slip)}: case matters)" if slip else ""
-        hint = f"{before}{parsed.number} {right}".removesuffix(" 1") if right else ""
-        # A rate in the place of a time, or the other way round; radians don't say how long a turn takes.
+        fix = f"{before}{parsed.number} {right}".removesuffix(" 1") if right else ""
+        # A rate instead of a time or the reverse; a rate in radians has no unique period.
         if actual == due.power(-1) and actual.turning != "rad" and parsed.value:
-            hint = f"{before}{float(1 / (parsed.value * requested.scale)):.9g} {unit}"
-    raise ApcError(Diagnostic("E204", location, subject, named, got, hint))
+            fix = f"{before}{float(1 / (parsed.value * requested.scale)):.9g} {unit}"
+    raise ApcError(Diagnostic("E204", location, subject, named, got, fix))
 
 
-def _meant(unit: Unit, requested: Unit) -> tuple[str, str]:
-    """Return a unit of the dimension that is wanted in which the number as written may be meant.
+def _finite_number(named: str, text: str) -> str:
+    """Return the expected value of a text that is not a number: a finite number if it is written as a number
+    that is not finite.
+    """
+    if not re.match(r"\s*[-+]?(\.?(nan|inf)|[\d.]+\s*/\s*0)", text, re.IGNORECASE):
+        return named
+    return "a finite number" if named == "a plain number" else f"a finite number in {named}"
 
-    That is the unit with a name in another case, which is returned as well, MS for ms; without one of its
-    exponents, or with a letter more; or failing that the one that is wanted, if a value in it is as large:
-    5 N/mm^2 are not proposed as 5 N/m, a millionth of it.
+
+def _in_usual_case(text: str, dimension: Dimension) -> str:
+    """Return a quantity whose unit has the dimension if its names are those of common units in another case.
+
+    The result is empty if there is no such unit.
+    """
+    start = _QUANTITY_START.match(text)
+    if start is None:
+        return ""
+    number, unit = text[: start.end()], text[start.end() :]
+    names = NAME.findall(unit)
+    if len(names) > MOST_CASED:
+        return ""
+    by_name = [[name, *(other for other in COMMON if other.lower() == name.lower())] for name in names]
+    for chosen in product(*by_name):
+        spelled = iter(chosen)
+        candidate = NAME.sub(lambda _: next(spelled), unit)  # noqa: B023 -- called at once
+        if _is_of(candidate, dimension):
+            return f"{number}{candidate}".strip()
+    return ""
+
+
+def _corrected_unit(unit: Unit, required: Unit) -> tuple[str, str]:
+    """Return the unit that was probably intended, and the misspelled name in it.
+
+    The result has two empty texts if there is none.
+
+    The candidates have the required dimension: the unit with a name in another case (MS for ms), with one
+    exponent removed, or with one letter more. The last candidate is the required unit, if it has the same
+    scale: 5 N/m is not proposed for 5 N/mm^2, which is a million times more. The second text is empty if no
+    name differs only in case.
     """
     text = unit.text
     others = [(name, other) for name in NAME.findall(text) for other in COMMON if other != name]
@@ -239,12 +300,12 @@ def _meant(unit: Unit, requested: Unit) -> tuple[str, str]:
     texts += [(text[: match.start()] + text[match.end() :], "") for match in _EXPONENT.finditer(text)]
     longer = ((name, other) for name, other in others if other[:-1] == name)
     texts += [(re.sub(rf"\b{re.escape(name)}\b", other, text), "") for name, other in longer]
-    fitting = (candidate for candidate in texts if _is_of(candidate[0], requested.dimension))
-    return next(fitting, (requested.text if unit.scale == requested.scale else "", ""))
+    candidates = (candidate for candidate in texts if _is_of(candidate[0], required.dimension))
+    return next(candidates, (required.text if unit.scale == required.scale else "", ""))
 
 
 def _is_of(text: str, dimension: Dimension) -> bool:
-    """Return whether a text is a unit of a dimension; False if it cannot be read as a unit."""
+    """Return whether a text is a unit of the dimension; False for an invalid unit."""
     try:
         return _unit(text).dimension == dimension
     except ParseError:
@@ -253,22 +314,23 @@ def _is_of(text: str, dimension: Dimension) -> bool:
 
 @lru_cache(maxsize=4096)
 def _quantity(text: str) -> Quantity:
+    """Return the quantity of a text, cached. Raises ParseError."""
     if len(text) > MAX_LENGTH:
-        raise ParseError("E221", 0, "a quantity", f"at most {MAX_LENGTH} characters", f"{len(text)}")
+        raise ParseError("E221", 0, "quantity", f"at most {MAX_LENGTH} characters", f"{len(text)}")
     match = _QUANTITY_START.match(text)
     if match is None:
         bare = text.strip()
         expected = "a finite number" if _NOT_FINITE.match(bare) else "a number and its unit"
-        hint = bare.replace("−", "-") if bare.startswith("−") else ""
-        raise ParseError("E221", 0, "a quantity", expected, cut(bare) or "nothing", hint=hint)
+        fix = bare.replace("−", "-") if bare.startswith("−") else ""
+        raise ParseError("E221", 0, "quantity", expected, cut(bare) or "nothing", fix=fix)
     number, rest, end = match.group().strip(), text[match.end() :], match.end()
     if re.match(r",[0-9]", rest):
-        hint = cut(f"{number}.{rest[1:].strip()}")
-        raise ParseError("E221", end, "a number has a decimal point, not a comma", hint=hint)
+        fix = cut(f"{number}.{rest[1:].strip()}")
+        raise ParseError("E221", end, "number: expected a decimal point, got a comma", fix=fix)
     value = _number(number, end - len(number))
     if re.match(r"\s*/", rest):
-        hint = f"{number} 1{rest.strip()}"
-        raise ParseError("E222", end, "a unit", "something above the /", "nothing", hint=hint)
+        fix = f"{number} 1{rest.strip()}"
+        raise ParseError("E222", end, "unit", "a numerator before /", "none", fix=fix)
     try:
         unit = _unit(rest) if rest.strip() else NO_UNIT
         float(value * unit.scale)
@@ -276,35 +338,35 @@ def _quantity(text: str) -> Quantity:
         fault.offset += end
         raise
     except OverflowError:
-        raise ParseError("E226", 0, "this quantity is too large for a number") from None
+        raise ParseError("E226", 0, "the quantity is too large") from None
     return Quantity(value * unit.scale, unit, number)
 
 
 def _number(text: str, offset: int) -> Fraction:
-    """Return the exact value of a number or of a quotient of two."""
+    """Return the exact value of a number or of a quotient of two numbers. Raises ParseError."""
     check_size(text, offset, "E226")
-    above, _, below = text.partition("/")
+    numerator, _, denominator = text.partition("/")
     try:
-        return Fraction(above) / Fraction(below or "1")
+        return Fraction(numerator) / Fraction(denominator or "1")
     except ZeroDivisionError:
-        raise ParseError("E221", offset, f"{cut(text)} divides by zero") from None
+        raise ParseError("E221", offset, f"division by zero in {cut(text)}") from None
 
 
 @lru_cache(maxsize=1024)
 def _unit(text: str) -> Unit:
-    """Return a unit: the product of its names according to Pint."""
+    """Return the unit of a text, cached: its scale and dimension by Pint. Raises ParseError."""
     if len(text) > MAX_LENGTH:
-        raise ParseError("E222", 0, "a unit", f"at most {MAX_LENGTH} characters", f"{len(text)}")
+        raise ParseError("E222", 0, "unit", f"at most {MAX_LENGTH} characters", f"{len(text)}")
     try:
         powers = _grammar()(text, "unit")
     except UnexpectedCharacters as fault:
         expected = "names joined by * and /, with exponents such as ^2"
-        raise ParseError("E222", fault.pos_in_stream, "a unit", expected, repr(fault.char)) from None
+        raise ParseError("E222", fault.pos_in_stream, "unit", expected, repr(fault.char)) from None
     except UnexpectedToken as fault:
         _refuse(text, fault)
     dimensions = registry().get_dimensionality(powers)
     if any(abs(power) > MAX_EXPONENT for power in (*powers.values(), *dimensions.values())):
-        message = f"{cut(text.strip())} is no unit of this world: an exponent or its scale is too large"
+        message = f"unit {cut(text.strip())}: an exponent or the scale is too large"
         raise ParseError("E225", 0, message)
     # The square of the scale, so that the root of a square is exact; Pint's unit of mass is the gram.
     square, _ = registry().get_root_units(powers**2)
@@ -312,15 +374,15 @@ def _unit(text: str) -> Unit:
     rational = Fraction(square)
     scale = Fraction(math.isqrt(rational.numerator), math.isqrt(rational.denominator))
     if isinstance(square, float) or scale**2 != square:
-        expected = "a root whose scale is a rational number"
-        raise ParseError("E222", len(text.rstrip()), "a unit", expected, "its end")
+        message = f"unit {cut(text.strip())}: the scale is not a rational number"
+        raise ParseError("E222", len(text) - len(text.lstrip()), message)
     exponents = tuple(sorted((_BASES[base], power) for base, power in dimensions.items()))
     return Unit(text.strip(), scale, Dimension(exponents, _turning(text)))
 
 
 def _refuse(text: str, fault: UnexpectedToken) -> NoReturn:
-    """Raise E222 for a character that cannot follow in a unit."""
-    token, bare, hint = fault.token, text.strip(), ""
+    """Raise ParseError (E222) for a token that cannot follow in a unit."""
+    token, bare, fix = fault.token, text.strip(), ""
     if "NAME" in fault.expected:
         expected = "a name such as N, m or s"
     elif "$END" not in fault.expected and "NUMBER" in fault.expected:
@@ -328,15 +390,15 @@ def _refuse(text: str, fault: UnexpectedToken) -> NoReturn:
     elif unclosed(fault.state.value_stack) >= 0:
         expected = ")"
     else:
-        expected, joined = "* or / between two names", re.sub(r"(\w)\s+(?=\w)", r"\1*", bare)
-        hint = joined if joined != bare and "+" not in bare else ""
+        expected, joined = "* or / between two unit names", re.sub(r"(\w)\s+(?=\w)", r"\1*", bare)
+        fix = joined if joined != bare and "+" not in bare else ""
     at = len(text.rstrip()) if token.type == "$END" else token
-    got = {"$END": "its end", "POWER": "^"}.get(token.type, str(token))
-    raise ParseError("E222", at, "a unit", expected, got, hint)
+    got = {"$END": "the end of the text", "POWER": "^"}.get(token.type, str(token))
+    raise ParseError("E222", at, "unit", expected, got, fix)
 
 
 def _turning(text: str) -> str:
-    """Return whether a unit counts cycles ("Hz") or radians ("rad"); an empty text if neither."""
+    """Return the angle unit that a unit contains: cycles ("Hz") or radians ("rad"); empty if none."""
     for name in map(_long_name, NAME.findall(text)):
         if name.endswith("hertz"):
             return "Hz"
@@ -346,58 +408,65 @@ def _turning(text: str) -> str:
 
 
 class _Units(TREE):
-    """The actions of the rules of unit.lark: Pint's products of powers of names."""
+    """The actions of the rules of unit.lark, which return Pint's products of powers of names."""
 
     def NAME(self, token: Token) -> Any:
-        return registry().UnitsContainer({_in_catalogue(token): Fraction(1)})
+        """Return the unit of a name."""
+        return registry().UnitsContainer({_supported_name(token): Fraction(1)})
 
     def unity(self, parts: list[Token]) -> Any:
+        """Return the unit 1. Raises ParseError for other numbers."""
         if parts[0] != "1":
             expected = "a name such as N, m or s"
-            raise ParseError("E222", parts[0], "a unit", expected, str(parts[0]))
+            raise ParseError("E222", parts[0], "unit", expected, str(parts[0]))
         return registry().UnitsContainer()
 
     def times(self, parts: list[Any]) -> Any:
+        """Return a product of units."""
         return parts[0] * parts[2]
 
     def over(self, parts: list[Any]) -> Any:
+        """Return a quotient of units."""
         return parts[0] / parts[1]
 
     def raised(self, parts: list[Any]) -> Any:
+        """Return a power of a unit."""
         exponent = parts[-1]
         return parts[0] ** (Fraction(2 + "²³".index(exponent)) if token_type_of(exponent) else exponent)
 
     def exponent(self, parts: list[Token]) -> Fraction:
+        """Return an exponent. Raises ParseError if it is too large or divides by zero."""
         for part in parts:
             if part.type == "NUMBER" and int(part) > MAX_EXPONENT:
                 expected = f"a whole exponent up to {MAX_EXPONENT}"
-                raise ParseError("E222", part, "a unit", expected, str(part))
+                raise ParseError("E222", part, "unit", expected, str(part))
         try:
             return exponent_of(parts)
         except ZeroDivisionError:
-            expected = "an exponent that does not divide by zero"
-            raise ParseError("E222", parts[-1].end_pos, "a unit", expected, ")") from None
+            message = "unit: division by zero in the exponent"
+            raise ParseError("E222", parts[-1].end_pos, message) from None
 
 
 @cache
 def _grammar() -> Callable[[str, str], Any]:
+    """Return the parser of units."""
     return parser("unit.lark", ["unit"], _Units())
 
 
 @cache
 def registry() -> Any:
-    """Return Pint's registry of the units there are, with exact numbers."""
+    """Return Pint's registry of the supported units, with exact numbers."""
     return pint.UnitRegistry(str(Path(__file__).with_name("units.txt")), non_int_type=Fraction)
 
 
 @cache
-def _everything() -> Any:
-    """Return Pint's registry of all its units, for messages: creation takes a third of a second."""
+def _full_registry() -> Any:
+    """Return Pint's registry of all its units, for messages; its creation takes a third of a second."""
     return pint.UnitRegistry(non_int_type=Fraction)
 
 
 def _long_name(name: str) -> str:
-    """Return Pint's long name of a unit: `megasiemens` for MS; an empty text if there is none."""
+    """Return Pint's long name of a unit: `megasiemens` for MS; empty if the unit is not supported."""
     for prefix, unit, _ in registry().parse_unit_name(name)[:1]:
         prefixed = unit in registry().get_group("Prefixed").members
         if not prefix or (prefixed and not (unit == "second" and prefix in _LONG)):
@@ -405,32 +474,53 @@ def _long_name(name: str) -> str:
     return ""
 
 
-def _in_catalogue(name: Token) -> str:
-    """Return the long name of a unit. Raises FaultError: E223 no such unit, E224 no multiple of SI."""
+def _supported_name(name: Token) -> str:
+    """Return the long name of a supported unit.
+
+    Raises ParseError: E223 an unknown unit, E224 an unsupported unit.
+    """
     if long_name := _long_name(name):
         return long_name
-    every = _everything()
-    # Nm is a yarn count to Pint, and a slip for N*m to everyone else.
+    every = _full_registry()
+    # Nm is a yarn count in Pint; here it is a mistake for N*m.
     others = [(prefix, unit) for prefix, unit, _ in every.parse_unit_name(name) if unit != "number_meter"]
     if not others:
-        raise ParseError("E223", name, f"there is no unit {cut(name)}", hint=_proposal(name), subject=name)
+        message = f"unknown unit {_spelled(name)}"
+        raise ParseError("E223", name, message, fix=_proposal(name), subject=name)
     (prefix, unit), *_ = others
     spelled = f"{prefix}{unit}".replace("_", " ")
     roots = every.get_root_units(unit)[1]._units
     if not every._units[unit].is_multiplicative or any(root not in registry() for root in roots):
-        message = f"{name} ({prefix}{unit}) is no multiple of an SI unit"
-        raise ParseError("E224", name, message, hint="K" if "degree_" in unit else "")
+        shown = f"unit {name}" + (f" ({spelled})" if spelled != name else "")
+        message = f"{shown} is not supported"
+        raise ParseError("E224", name, message, fix="K" if "degree_" in unit else "", subject=name)
     dimension = every.get_dimensionality(unit)
     like = [other for other in COMMON if registry().get_dimensionality(other) == dimension]
-    proposed = f"; there are {', '.join(like[:3])}" if like else ""
-    message = f"there is no unit {name} here: {spelled} is not supported{proposed}"
+    proposed = f"; supported: {', '.join(like[:3])}" if like else ""
+    spelled = f" ({spelled})" if spelled != name else ""
+    message = f"unit {name}{spelled} is not supported{proposed}"
     lower = name.lower()
     similar = (other for other in like if lower == other.lower() or lower.startswith(other))
-    raise ParseError("E223", name, message, hint=next(similar, ""), subject=name)
+    raise ParseError("E223", name, message, fix=next(similar, ""), subject=name)
+
+
+# Cyrillic letters of units, as in кг.
+_CYRILLIC = str.maketrans("кгмсНКМГ", "kgmsNKMG")
+
+
+def _spelled(name: str) -> str:
+    """Return a name with its first letter that is not ASCII spelled out."""
+    foreign = next((letter for letter in name if not letter.isascii()), "")
+    described = unicodedata.name(foreign, "unnamed character") if foreign else ""
+    return cut(name) + (f" (U+{ord(foreign):04X}, {described})" if foreign else "")
 
 
 def _proposal(name: str) -> str:
-    """Return the probable intention: another case, an exponent, a product, or the nearest common name."""
+    """Return the unit that was probably intended: another case, an exponent, a product, or the nearest
+    common name.
+    """
+    if (latin := name.translate(_CYRILLIC)) in COMMON:
+        return latin
     for other in COMMON:
         if other.lower() == name.lower():
             return other

@@ -3,7 +3,7 @@
 Takes: scalars of YAML. Gives: `ValueBinding`, the value as written, by `read_binding` or `read_free`;
 `ScalarValue`, the number, by `settle`; `resolve_in_order`, `renamed`; `Bounds`, `is_quantity`,
 `text_location`; `AlreadyReportedError`.
-Guarantees: dimensions agree and bounds hold, or an error reports it with its location.
+Guarantees: dimensions agree and bounds hold, or an error with its location is raised or recorded.
 Does not: handle sections, parts or peers.
 """
 
@@ -22,22 +22,22 @@ from apc.compiler.language.expression import FUNCTIONS, Expr, Name, format_expre
 from apc.compiler.language.grammar import parse_expression
 from apc.compiler.language.unit_check import ANY, dimension_of
 from apc.compiler.language.unit_text import format_dimension, format_si
-from apc.compiler.language.units import parse_quantity, parse_unit, quantity
+from apc.compiler.language.units import COMMON, parse_quantity, parse_unit, quantity
 from apc.compiler.language.vectors import number_of
 from apc.compiler.source.nodes import Node, Scalar
-from apc.compiler.source.reading import brief, either_comma, fault, text_of, unknown
+from apc.compiler.source.reading import brief, either_comma, fault, named, text_of, unknown
 from apc.compiler.wording import with_unit
 
 PEERS = ("peers",)
 
-# A quantity starts with a number or a ratio such as 1/90; what follows is nothing or a unit, which may start
-# with a parenthesis or, behind a space, as 1/s does. An operator behind the number makes it an expression.
+# A quantity starts with a number or a ratio such as 1/90, followed by nothing or a unit. A unit may start
+# with a parenthesis or, after a space, with 1/ as in 1/s. A number followed by an operator is an expression.
 _QUANTITY = re.compile(
     r"[+-]?\s*([0-9]|\.[0-9])[0-9.]*([eE][+-]?[0-9]+)?(\s*/\s*[0-9][0-9.]*)?"
     r"(\s*([^\W\d_]|[°%µΩ(]).*|\s+1\s*[*·⋅/].*|\s*)\Z",
     re.DOTALL,
 )
-# 1 000 N/m; and 2*pi*100 N/m, a product of numbers alone with a unit behind it.
+# Thousands separators as in 1 000 N/m, a decimal comma, and a product of numbers with a unit: 2*pi*100 N/m.
 _SPACED = re.compile(r"[+-]?[0-9]{1,3}([ _'\u00a0\u2009][0-9]{3})+(?![0-9])")
 _COMMA = re.compile(r"([+-]?[0-9]+),([0-9]+)([^0-9,].*)?", re.DOTALL)
 _COMPUTED = re.compile(r"(?P<numbers>[-+*/^().\d\s]*(?:pi[-+*/^().\d\s]*)*)(?P<unit>[^\W\d_°%µΩ].*)")
@@ -47,7 +47,9 @@ _WORD_NUMBER = re.compile(r"[+-]?\.?(nan|inf|infinity)\b", re.IGNORECASE)
 
 @dataclass(frozen=True, slots=True)
 class ValueBinding:
-    """A number as written: `number` in SI and the `unit` it was written in, or an `expression` over names."""
+    """A number as written: `number` in SI units with the `unit` of the text, or an `expression`
+    over names.
+    """
 
     number: Fraction | None
     expression: Expr | None
@@ -58,8 +60,9 @@ class ValueBinding:
 
 @dataclass(frozen=True, slots=True)
 class ScalarValue:
-    """A number, in SI; `expression` is its tree if it depends on others; `unit` is that of its
-    `ValueBinding`.
+    """A number in SI units.
+
+    `expression` is its tree if it depends on other numbers; `unit` is the unit of the text.
     """
 
     number: Fraction
@@ -69,23 +72,25 @@ class ScalarValue:
     unit: str = ""
 
     def __str__(self) -> str:
-        """Return the number in the unit in which it was written, without one in SI."""
+        """Return the number in the unit of the text; in SI units if there is none."""
         if not self.unit:
             return format_si(float(self.number), self.dimension)
         return with_unit(f"{float(self.number / parse_unit(self.unit, self.location).scale):.6g}", self.unit)
 
 
 class AlreadyReportedError(ApcError):
-    """Raised by a look-up for a name whose own fault was reported: what depends on it needs no message."""
+    """The error of a name is already reported: a value that depends on the name dependencies no message of
+    its own.
+    """
 
     def __init__(self) -> None:
-        """Hold no mistake."""
+        """Create the error without a mistake."""
         self.mistakes = ()
 
 
 @dataclass(frozen=True, slots=True)
 class Bounds:
-    """The range of a number, in SI; `unit` is the one for its messages."""
+    """The range of a number, in SI units; `unit` and `scale` are the unit in messages."""
 
     unit: str
     scale: Fraction
@@ -94,7 +99,7 @@ class Bounds:
     maximum: Fraction | None = None
 
     def fault(self, number: Fraction) -> str:
-        """Return the violated bounds in words, else an empty text."""
+        """Return the violated bound as text, empty if there is none."""
         least = self.minimum
         if least is not None and (number < least or (self.exclusive_minimum and number == least)):
             shown = f"{self._shown(least)} {self.unit}"
@@ -104,22 +109,23 @@ class Bounds:
         return ""
 
     def check(self, value: ScalarValue, subject: str, mistakes: Mistakes) -> None:
-        """Record a number that breaks the bounds."""
+        """Record an error (E207) for a number out of bounds."""
         if expected := self.fault(value.number):
             got = f"{self._shown(value.number)} {self.unit}"
             mistakes.add("E207", value.location, subject, expected=expected, got=got)
 
     def _shown(self, number: Fraction) -> str:
+        """Return the text of a number in the unit of messages."""
         return f"{float(number / self.scale):.12g}"
 
 
 def is_quantity(text: str) -> bool:
-    """Return whether a text is meant as a number with or without a unit, not as an expression."""
+    """Return whether a text is a number with or without a unit, in contrast to an expression."""
     return bool(_QUANTITY.match(text) or _WORD_NUMBER.match(text))
 
 
 def text_location(node: Node) -> SourceLocation:
-    """Return the start of a scalar's text: after the opening quote, if any."""
+    """Return the location of a scalar's text: after the opening quote, if there is one."""
     quoted = isinstance(node, Scalar) and not node.plain
     return node.location.shifted(1) if quoted else node.location
 
@@ -133,7 +139,7 @@ def read_binding(
     names_known: Collection[str],
     words: Collection[tuple[str, Fraction]] = (),
 ) -> ValueBinding:
-    """Read a number: a quantity, a word that represents one, or an expression.
+    """Return the number of a node: a quantity, a word that represents a number, or an expression.
 
     Parameters
     ----------
@@ -144,20 +150,20 @@ def read_binding(
     dimension, unit
         The required dimension and unit.
     known
-        The dimension of a name an expression may use, or None.
+        The function that returns the dimension of a name in an expression, or None if the name is unknown.
     names_known
-        All these names, for messages.
+        All known names, for messages.
     words
         Words that represent numbers.
 
     Raises
     ------
     ApcError
-        E203 not a single value, E204 a unit that does not match, E206 for every unknown name; and those of
-        `quantity`, `parse_expression` and `dimension_of`.
+        E203 a node that is not a single value, E204 a unit of a wrong dimension, E206 for every unknown name;
+        and the errors of `quantity`, `parse_expression` and `dimension_of`.
     """
     text, location = text_of(node, subject, f"{subject}: 1 {unit}"), node.location
-    number, local = dict(words).get(text), ""
+    number, written_unit = dict(words).get(text), ""
     if number is None:
         _refuse_marks(text, location, subject)
         _refuse_computed(text, location, subject, unit)
@@ -166,20 +172,20 @@ def read_binding(
             tree = _tree(text, location)
             actual = _dimension(tree, text, location, subject, known, names_known)
             if actual is not None and actual != ANY and (actual != dimension or actual.clashes(dimension)):
-                got, hint = _misfit(tree, actual, dimension, unit)
+                got, fix = _misfit(tree, actual, dimension, unit)
                 raise fault(
-                    "E204", location, subject, unit, f"{brief(text)}, which {got}", f"{subject}: {hint}"
+                    "E204", location, subject, unit, f"{brief(text)}, which {got}", f"{subject}: {fix}"
                 )
             return ValueBinding(None, tree, dimension, location)
         _refuse_trailing(text, location, subject, names_known)
         _refuse_mixture(text, location, subject, names_known)
-        read = quantity(text, location, subject=subject, unit=unit)
-        number, local = read.value, read.unit.text
-    return ValueBinding(number, None, dimension, location, local)
+        parsed = quantity(text, location, subject=subject, unit=unit)
+        number, written_unit = parsed.value, parsed.unit.text
+    return ValueBinding(number, None, dimension, location, written_unit)
 
 
 def _refuse_marks(text: str, location: SourceLocation, subject: str) -> None:
-    """Raise ApcError for a number with a decimal comma, or with thousands separators."""
+    """Raise ApcError for a number with a decimal comma or with thousands separators."""
     bare = text.strip()
     if (match := _COMMA.fullmatch(bare)) is not None:
         raise fault(
@@ -187,22 +193,22 @@ def _refuse_marks(text: str, location: SourceLocation, subject: str) -> None:
         )
     if (match := _SPACED.match(bare)) is not None:
         joined = re.sub(r"[^0-9+-]", "", match[0]) + bare[match.end() :]
-        expected = "a number without spaces or marks inside"
+        expected = "a number without separators"
         raise fault("E221", location, subject, expected, brief(text), f"{subject}: {joined}")
 
 
 def _refuse_computed(text: str, location: SourceLocation, subject: str, unit: str) -> None:
-    """Raise ApcError for numbers that are computed and have a unit behind them, as 2*pi*100 N/m."""
+    """Raise ApcError for a computed number followed by a unit, such as 2*pi*100 N/m."""
     match = _COMPUTED.fullmatch(text.strip())
     if match is None or is_quantity(text) or not match["numbers"].strip():
         return
-    hint = ""
+    fix = ""
     with Mistakes():
         number = evaluate(parse_expression(match["numbers"], location), lambda _: 0, location)
         if parse_unit(match["unit"], location).dimension == parse_unit(unit, location).dimension:
-            hint = f"{subject}: {float(number):.9g} {match['unit']}"
-    if hint:
-        raise fault("E204", location, subject, _NO_UNITS, brief(text), hint)
+            fix = f"{subject}: {float(number):.9g} {match['unit']}"
+    if fix:
+        raise fault("E204", location, subject, _NO_UNITS, brief(text), fix)
 
 
 # A number next to a word, without a sign between them.
@@ -210,19 +216,21 @@ _BESIDE = re.compile(r"(?P<number>[+-]?[\d.]+(?:[eE][+-]?\d+)?)\s*(?P<rest>\(*(?
 
 
 def _refuse_trailing(text: str, location: SourceLocation, subject: str, names_known: Collection[str]) -> None:
-    """Raise ApcError for a number next to a name without a sign between them, as 2pi*f."""
+    """Raise ApcError for a number next to a name without an operator, such as 2pi*f."""
     implicit_product = _BESIDE.match(text.strip())
     if implicit_product is None or implicit_product["word"] not in {*names_known, "pi", *FUNCTIONS}:
         return
     with Mistakes():
         parse_unit(implicit_product["word"], location)
         return
-    hint = f"{subject}: {implicit_product['number']}*{text.strip()[implicit_product.start('rest') :]}"
-    raise fault("E204", location, subject, _NO_UNITS, brief(text), hint)
+    fix = f"{subject}: {implicit_product['number']}*{text.strip()[implicit_product.start('rest') :]}"
+    raise fault("E204", location, subject, _NO_UNITS, brief(text), fix)
 
 
 def _refuse_mixture(text: str, location: SourceLocation, subject: str, names_known: Collection[str]) -> None:
-    """Raise ApcError for a quantity with a unit that goes on as an expression, as 500 N/m/(peers - 1)."""
+    """Raise ApcError for a quantity with a unit that continues as an expression, such as 500
+    N/m/(peers - 1).
+    """
     for word in re.finditer(r"[A-Za-z]\w*", text):
         before = text[: word.start()].rstrip(" (")
         if word.group() in names_known and before[-1:] in ("*", "/", "+", "-"):
@@ -230,23 +238,24 @@ def _refuse_mixture(text: str, location: SourceLocation, subject: str, names_kno
                 parse_unit(word.group(), location)
                 return
             number, rest = before[:-1].strip(), text[len(before) - 1 :].strip()
-            hint = f"{subject}: total{rest}, with parameters: {{total: {number}}}"
-            raise fault("E204", location, subject, _NO_UNITS, brief(text), hint)
+            fix, advice = f"{subject}: total{rest}", f"define parameters: {{total: {number}}}"
+            raise fault("E204", location, subject, _NO_UNITS, brief(text), fix, advice)
 
 
 def _misfit(tree: Expr, actual: Dimension, due: Dimension, unit: str) -> tuple[str, str]:
-    """Return the error for an expression of a wrong dimension, with a suggestion."""
+    """Return the texts for an expression of a wrong dimension: its actual unit, and the value of the fix."""
     if actual != due:
         got = "has no unit" if actual == DIMENSIONLESS else f"is in {format_dimension(actual)}"
         return got, f"1 {unit}".removesuffix(" 1")
-    # Of a name, a sum or a choice: no product counts cycles or radians.
+    # The expression is a name, a sum or a choice: a product has no angle unit.
     text = format_expression(tree)
     whole = text if isinstance(tree, Name) else f"({text})"
-    hint = f"2*pi*{whole}" if due.turning == "rad" else f"{whole}/(2*pi)"
-    return f"is in {format_dimension(actual)}", hint
+    fix = f"2*pi*{whole}" if due.turning == "rad" else f"{whole}/(2*pi)"
+    return f"is in {format_dimension(actual)}", fix
 
 
 def _tree(text: str, location: SourceLocation) -> Expr:
+    """Return the parsed expression of a number."""
     return number_of(parse_expression(text, location), text, location)
 
 
@@ -258,19 +267,27 @@ def _dimension(
     known: Callable[[tuple[str, ...]], Dimension | None],
     names_known: Collection[str],
 ) -> Dimension | None:
-    """Return an expression's dimension. Raises E206 for every name that isn't known, or as `dimension_of`."""
+    """Return the dimension of an expression.
+
+    Raises E206 for every unknown name, and the errors of `dimension_of`.
+    """
     mistakes = Mistakes()
     for node in names(tree):
         if known(node.parts) is None:
             shown = ".".join(node.parts)
-            got = f"{subject} names {brief(shown)}, which is no parameter here"
-            mistakes.take(unknown("E206", location_in(location, text, node.start), got, shown, names_known))
+            at, got = location_in(location, text, node.start), f"{subject}: unknown name {named(shown)}"
+            error = unknown("E206", at, got, shown, names_known)
+            advice = f"write a number with its unit, or define {brief(shown)} in parameters"
+            if not error.mistakes[0].fix and (shown in COMMON or set(names_known) <= set(PEERS)):
+                advice = "a unit directly follows a number, as in 5 N/m" if shown in COMMON else advice
+                error = fault("E206", at, got, advice=advice)
+            mistakes.take(error)
     mistakes.raise_if_any()
     return dimension_of(tree, lambda name: known(name.parts), text, location)
 
 
 def settle(binding: ValueBinding, number_of: Callable[[tuple[str, ...]], Fraction]) -> ScalarValue:
-    """Return the value of a binding, given the values of its names."""
+    """Return the value of a binding; `number_of` returns the value of a name."""
     if binding.expression is None:
         assert binding.number is not None
         return ScalarValue(binding.number, binding.dimension, None, binding.location, binding.unit)
@@ -279,7 +296,10 @@ def settle(binding: ValueBinding, number_of: Callable[[tuple[str, ...]], Fractio
 
 
 def read_free(node: Node, subject: str, others: Collection[str]) -> ValueBinding:
-    """Read a number of any unit: a quantity, or an expression over others whose names are checked later."""
+    """Return the number of a node with any unit: a quantity, or an expression.
+
+    `others` are the names of other numbers; the names in the expression are checked later.
+    """
     text, location = text_of(node, subject, f"{subject}: 2000 N/m"), text_location(node)
     if not is_quantity(text):
         return ValueBinding(None, _tree(text, location), DIMENSIONLESS, location)
@@ -291,7 +311,7 @@ def read_free(node: Node, subject: str, others: Collection[str]) -> ValueBinding
 def resolve_in_order(
     waiting: Mapping[str, ValueBinding], peers: int | None, mistakes: Mistakes
 ) -> dict[str, ScalarValue]:
-    """Evaluate named numbers that depend on each other, in order of dependence.
+    """Return the values of named numbers that depend on each other, evaluated in order of dependence.
 
     Parameters
     ----------
@@ -300,47 +320,50 @@ def resolve_in_order(
     peers
         The value of the name `peers`; None if its error was reported.
     mistakes
-        Collects E206 an unknown name, E209 a cycle, and errors of evaluation.
+        The collector of errors: E206 an unknown name, E209 a cycle, and errors of evaluation.
 
     Returns
     -------
-    The values, in the order of `waiting`; the error of a missing one was reported once, at its location.
+    The values, in the order of `waiting`; the error of a missing value is recorded once, at its location.
     """
-    needs = {
+    dependencies = {
         name: {".".join(node.parts) for node in names(binding.expression)} if binding.expression else set()
         for name, binding in waiting.items()
     }
     try:
-        order = [*TopologicalSorter(needs).static_order()]
+        order = [*TopologicalSorter(dependencies).static_order()]
     except CycleError as error:
         chain = error.args[1][:0:-1]
         first = min(range(len(chain)), key=lambda k: [*waiting].index(chain[k]))
         chain = [*chain[first:], *chain[:first], chain[first]]
         mistakes.add(
-            "E209", waiting[chain[0]].location, f"parameters depend in a circle: {' → '.join(chain)}"
+            "E209", waiting[chain[0]].location, f"cyclic dependency of parameters: {' → '.join(chain)}"
         )
         return {}
-    settled = {"peers": ScalarValue(Fraction(peers or 0), DIMENSIONLESS, None, SourceLocation(""))}
+    values = {"peers": ScalarValue(Fraction(peers or 0), DIMENSIONLESS, None, SourceLocation(""))}
     if peers is None:
-        settled.clear()
+        values.clear()
     for name in order:
-        if name in waiting and needs[name] & {*waiting, "peers"} <= settled.keys():
+        if name in waiting and dependencies[name] & {*waiting, "peers"} <= values.keys():
             with mistakes:
-                settled[name] = _settled(name, waiting[name], settled)
-    return {name: settled[name] for name in waiting if name in settled}
+                values[name] = _evaluated(name, waiting[name], values)
+    return {name: values[name] for name in waiting if name in values}
 
 
-def _settled(name: str, binding: ValueBinding, settled: Mapping[str, ScalarValue]) -> ScalarValue:
+def _evaluated(name: str, binding: ValueBinding, values: Mapping[str, ScalarValue]) -> ScalarValue:
+    """Return the value of one named number, from the `values` of the numbers it depends on."""
+
     def dimension(parts: tuple[str, ...]) -> Dimension | None:
-        value = settled.get(".".join(parts))
+        """Return the dimension of a name, None if it has no value."""
+        value = values.get(".".join(parts))
         return None if value is None else value.dimension
 
     if (tree := binding.expression) is not None:
-        actual = _dimension(tree, format_expression(tree), binding.location, name, dimension, settled)
+        actual = _dimension(tree, format_expression(tree), binding.location, name, dimension, values)
         binding = replace(binding, dimension=DIMENSIONLESS if actual in (None, ANY) else actual)
-    return settle(binding, lambda parts: settled[".".join(parts)].number)
+    return settle(binding, lambda parts: values[".".join(parts)].number)
 
 
-def renamed(tree: Expr, whole: Callable[[tuple[str, ...]], tuple[str, ...]]) -> Expr:
-    """Return an expression with every name made whole."""
-    return transform(tree, lambda node: Name(whole(node.parts)) if isinstance(node, Name) else None)
+def renamed(tree: Expr, qualify: Callable[[tuple[str, ...]], tuple[str, ...]]) -> Expr:
+    """Return an expression with every name replaced by its qualified name."""
+    return transform(tree, lambda node: Name(qualify(node.parts)) if isinstance(node, Name) else None)

@@ -1,16 +1,16 @@
-"""Vectors written out: an expression of vectors to one for each entry.
+"""Expansion of vectors: one scalar expression for each entry of an expression over vectors.
 
 Takes: `Expr` and `Equation`, and the size of every name: 0 for a number.
 Gives: `written_out`, `written_equation`, `number_of`; `entry`, `entries`, `whole_and_index`, `by_vector`,
 `sizes_of`.
-Guarantees: what is written out holds no vector; each piece keeps the place it has in the text; sizes that do
-not fit are refused with what to write.
-Does not: check units, or know what a name is of.
+Guarantees: an expanded expression has no vectors; each part keeps its location in the text; wrong sizes are
+errors with a fix.
+Does not: check units, or resolve names.
 
 Equations between vectors hold for each entry, as in Modelica (Modelica Language Specification 3.6, section
-10.6): sums and branches are of one size, a number scales a vector, an operator or function of one number is
-taken of each entry. The entries of `a.x` are `a.x[1]`, `a.x[2]`, … A product of two vectors is written `dot`
-or `cross`.
+10.6): terms of a sum and branches have the same size, a number scales a vector, an operator or function of
+one number is applied to each entry. The entries of `a.x` are `a.x[1]`, `a.x[2]`, … A product of two vectors
+is written `dot` or `cross`.
 """
 
 from __future__ import annotations
@@ -40,39 +40,39 @@ from apc.compiler.language.grammar import MAX_LENGTH
 
 T = TypeVar("T")
 SIZES = (2, 3)
-LONGEST_REPEATED = 20  # characters of a number that a message writes once for each entry
+LONGEST_REPEATED = 20  # characters of the longest number that a message repeats for each entry
 
-# Which parts of an operation are numbers, never vectors, and which are left as they are.
+# The arguments of an operation that must be numbers, and the arguments that are not expanded.
 NUMBERS: dict[str, tuple[int, ...]] = {
     **dict.fromkeys(CONDITIONS, (0, 1)),
     **dict.fromkeys(("/", "hold", "interpolate"), (1,)),
     "if": (0,),
 }
-AS_THEY_ARE: dict[str, tuple[int, ...]] = {"sample": (1,), "interpolate": (0,)}
+UNCHANGED: dict[str, tuple[int, ...]] = {"sample": (1,), "interpolate": (0,)}
 
-# An expression written out: the entries of a vector, one of a number; None where a size isn't known yet.
+# An expanded expression: the entries of a vector, or one number; None if a size is not yet known.
 Written = tuple[Expr, ...] | None
 SizeOf = Callable[[tuple[str, ...]], int | None]
 
 
 def entry(name: str, index: int) -> str:
-    """Return the name of a vector's entry, counted from 1."""
+    """Return the name of an entry of a vector, with an index from 1."""
     return f"{name}[{index}]"
 
 
 def entries(name: str, size: int) -> tuple[str, ...]:
-    """Return the names that a declaration makes: those of a vector's entries, or the name of a number."""
+    """Return the names of the entries of a vector, or the name of a number if `size` is 0."""
     return tuple(entry(name, k + 1) for k in range(size)) if size else (name,)
 
 
 def whole_and_index(name: str) -> tuple[str, int]:
-    """Return the vector that an entry is of, and which it is; of a number its name and 0."""
-    whole, bracket, index = name.rstrip("]").rpartition("[")
-    return (whole, int(index)) if bracket and name.endswith("]") else (name, 0)
+    """Return the name of the vector and the index of one of its entries; for a number its name and 0."""
+    vector, bracket, index = name.rstrip("]").rpartition("[")
+    return (vector, int(index)) if bracket and name.endswith("]") else (name, 0)
 
 
 def by_vector(items: Iterable[T], name: Callable[[T], str] = attrgetter("name")) -> dict[str, list[T]]:
-    """Return items grouped by the vectors of their entries; items of scalars are separate."""
+    """Return items grouped by vector name; a scalar item is a group of its own."""
     vectors: dict[str, list[T]] = {}
     for item in items:
         vectors.setdefault(whole_and_index(name(item))[0], []).append(item)
@@ -80,42 +80,51 @@ def by_vector(items: Iterable[T], name: Callable[[T], str] = attrgetter("name"))
 
 
 def sizes_of(names: Iterable[tuple[str, ...]]) -> dict[tuple[str, ...], int]:
-    """Return the vectors whose entries are among names, and the size of each."""
+    """Return the size of each vector whose entries are among the names."""
     sizes: dict[tuple[str, ...], int] = {}
     for parts in names:
         if parts[-1].endswith("]"):
-            whole, index = whole_and_index(parts[-1])
-            sizes[*parts[:-1], whole] = max(index, sizes.get((*parts[:-1], whole), 0))
+            vector, index = whole_and_index(parts[-1])
+            sizes[*parts[:-1], vector] = max(index, sizes.get((*parts[:-1], vector), 0))
     return sizes
 
 
 def written_out(expr: Expr, size_of: SizeOf, text: str, location: SourceLocation) -> Written:
-    """Return an expression for each entry of a vector, one for a number; None if its size isn't known yet.
+    """Return the expanded expression: one expression for each entry of a vector, or one for a number.
+
+    The result is None if the size is not yet known.
 
     Parameters
     ----------
     expr
-        The tree; its offsets count in `text`.
+        The tree; its offsets refer to `text`.
     size_of
-        Returns the size of a name, None if unknown.
+        The function that returns the size of a name: 0 for a number, None if unknown.
     text, location
-        The text, and where it starts.
+        The text, and its location.
 
     Raises
     ------
     ApcError
-        E328 it gets too long, E406 sizes that differ, E407 a vector where a number is due or the reverse.
+        E328 an expanded expression that is too long, E406 different sizes, E407 a vector instead of a number
+        or the reverse.
     """
     written = _VectorWriter(size_of, text, location).written(expr)
     for tree in written or (expr,):
         if len(list(islice(walk(tree), MAX_LENGTH + 1))) > MAX_LENGTH:
-            message = f"entry by entry this has more than {MAX_LENGTH} terms: give a part of it a name"
+            message = (
+                f"the expression has more than {MAX_LENGTH} terms, all entries included; give a "
+                "subexpression a name"
+            )
             raise ApcError(Diagnostic("E328", location_in(location, text, expr.start), message))
     return written
 
 
 def written_equation(equation: Equation, size_of: SizeOf) -> tuple[Equation, ...]:
-    """Return an equation for each entry; raises as `written_out`, also where its sides differ in size."""
+    """Return one scalar equation for each entry of an equation between vectors.
+
+    Raises the errors of `written_out`, and E406 if the sides have different sizes.
+    """
     writer = _VectorWriter(size_of, equation.text, equation.location)
     sides = (equation.left, equation.right)
     written = [written_out(side, size_of, equation.text, equation.location) or (side,) for side in sides]
@@ -124,28 +133,33 @@ def written_equation(equation: Equation, size_of: SizeOf) -> tuple[Equation, ...
 
 
 def number_of(expr: Expr, text: str, location: SourceLocation) -> Expr:
-    """Return an expression over numbers without `dot`, `norm` and the like. Raises E407 if it is a vector."""
+    """Return an expression over numbers with `dot`, `cross` and `norm` expanded. Raises E407 for a vector."""
     return _VectorWriter(lambda _: 0, text, location).number(expr)
 
 
 class _VectorWriter:
-    """Writes one text out; the first mistake is raised."""
+    """The expansion of one text; raises the first error."""
 
     def __init__(self, size_of: SizeOf, text: str, location: SourceLocation) -> None:
         self.size_of, self.text, self.location = size_of, text, location
 
     def fail(
-        self, code: str, at: Expr, expected: str, got: str = "", hint: str = "", within: str = ""
+        self, code: str, at: Expr, expected: str, got: str = "", fix: str = "", within: str = ""
     ) -> NoReturn:
+        """Raise an error located at a part of the expression; `within` is added to the text of the part."""
         message, location = (
             as_written(at, self.text) + within,
             location_in(self.location, self.text, at.start),
         )
-        raise ApcError(Diagnostic(code, location, message, expected, got, hint))
+        raise ApcError(Diagnostic(code, location, message, expected, got, fix))
 
     def written(self, expr: Expr) -> Written:
+        """Return the expanded expression: a tuple of entries, or of one number.
+
+        The result is None if the size is unknown.
+        """
         match expr:
-            case NumberLiteral() | Call("count"):  # peers are counted, whatever they send
+            case NumberLiteral() | Call("count"):  # the number of peers is a number for every argument
                 return (expr,)
             case Name(path):
                 size = self.size_of(path)
@@ -161,14 +175,14 @@ class _VectorWriter:
             return self.product(expr)
         if word == "^":
             inner, power = map(format_expression, parts)
-            hint = f"dot({inner}, {inner})" if power == "2" else f"norm({inner})^{power}"
-            return self.each(expr, [(self.number(parts[0], hint),), parts[1:]])
-        numbers, skipped = NUMBERS.get(word, ()), AS_THEY_ARE.get(word, ())
+            fix = f"dot({inner}, {inner})" if power == "2" else f"norm({inner})^{power}"
+            return self.each(expr, [(self.number(parts[0], fix),), parts[1:]])
+        numbers, skipped = NUMBERS.get(word, ()), UNCHANGED.get(word, ())
         written = [
             (part,) if k in skipped else (self.number(part),) if k in numbers else self.written(part)
             for k, part in enumerate(parts)
         ]
-        if word == "age":  # of a vector, which travels in one packet
+        if word == "age":  # all entries of a vector are in the same packet, with one age
             return (replace(expr, arguments=(written[0] or parts)[:1]),)
         is_vector = [_is_vector(part) for part in written]
         if word != "*":
@@ -177,24 +191,25 @@ class _VectorWriter:
             equal = [k for k in equal if is_vector[k] or word not in FUNCTIONS]
             self.agree([parts[k] for k in equal], [written[k] for k in equal])
         elif all(is_vector):
-            hint = f"dot({', '.join(map(format_expression, parts))})"
-            self.fail("E407", expr, "one vector at most in a product", "two", hint)
+            fix = f"dot({', '.join(map(format_expression, parts))})"
+            self.fail("E407", expr, "at most one vector in a product", "two", fix)
         return self.each(expr, written)
 
     def product(self, expr: Call) -> Written:
-        """Expand `dot`, `cross` and `norm`, each part at the location of the expression."""
+        """Return the expanded `dot`, `cross` or `norm`; every part has the location of the expression."""
         word, vectors = expr.function, list[tuple[Expr, ...]]()
         for argument in expr.arguments:
             if (written := self.written(argument)) is None:
                 return None if word == "cross" else (NumberLiteral(Fraction(0)),)
             if not _is_vector(written):
                 shown = [format_expression(part) for part in expr.arguments]
-                hint = {"norm": f"abs({shown[0]})", "dot": "*".join(shown)}.get(word, "")
-                self.fail("E407", argument, "a vector", "a number", hint, f" in {word}")
+                fix = {"norm": f"abs({shown[0]})", "dot": "*".join(shown)}.get(word, "")
+                self.fail("E407", argument, "a vector", "a number", fix, f" in {word}")
             vectors.append(written)
         self.agree(expr.arguments, vectors)
 
         def call(word: str, *parts: Expr) -> Expr:
+            """Return a node at the location of the expression."""
             return replace(expr, function=word, arguments=parts)
 
         a, b = vectors[0], vectors[-1]
@@ -206,43 +221,47 @@ class _VectorWriter:
         squares = (call("^", x, NumberLiteral(Fraction(2))) for x in a)
         return (call("sqrt", reduce(partial(call, "+"), squares)),)
 
-    def number(self, expr: Expr, hint: str = "") -> Expr:
-        """Return an expression that has to be a number."""
+    def number(self, expr: Expr, fix: str = "") -> Expr:
+        """Return the expanded expression of a number. Raises E407 for a vector."""
         written = self.written(expr) or (expr,)
         if _is_vector(written):
-            self.fail("E407", expr, "a number", _size(written), hint or self.of_vector(expr))
+            self.fail("E407", expr, "a number", _size(written), fix or self.of_vector(expr))
         return written[0]
 
     def agree(self, parts: Sequence[Expr], written: Sequence[Written]) -> None:
-        """Refuse parts that are not of one size."""
+        """Raise E406 if parts have different sizes."""
         pairs = [(part, other) for part, other in zip(parts, written, strict=True) if other is not None]
         for part, other in pairs[1:]:
             model, first = pairs[0]
             if len(first) == len(other):
                 continue
-            text, hint = format_expression(part), "" if _is_vector(first) else self.of_vector(part)
+            text, fix = format_expression(part), "" if _is_vector(first) else self.of_vector(part)
             if not _is_vector(other) and len(text) <= LONGEST_REPEATED:
-                hint = "{" + ", ".join([text] * len(first)) + "}"
-            self.fail("E406", part, f"{_size(first)} like {as_written(model, self.text)}", _size(other), hint)
+                fix = "{" + ", ".join([text] * len(first)) + "}"
+            self.fail("E406", part, f"{_size(first)} like {as_written(model, self.text)}", _size(other), fix)
 
     def each(self, call: Call, parts: Sequence[Written]) -> Written:
-        """Return a call of other arguments: one for each entry, where one of them is a vector."""
+        """Return a call with expanded arguments: one call for each entry if an argument is a vector."""
         size = max(len(part or ()) for part in parts)
         if None in parts and size < 2:
             return None
-        replaced = (part or (before,) for part, before in zip(parts, call.arguments, strict=True))
+        replaced = (part or (argument,) for part, argument in zip(parts, call.arguments, strict=True))
         rows = zip(*(part if _is_vector(part) else part * size for part in replaced), strict=True)
         return tuple(replace(call, arguments=row) for row in rows)
 
     def of_vector(self, expr: Expr) -> str:
-        """Return numbers that somebody may have meant who wrote a vector."""
+        """Return the text of numbers to propose instead of a vector, empty if there is none."""
         of = format_expression(expr)
+        if isinstance(expr, Call) and all(isinstance(part, NumberLiteral) for part in expr.arguments):
+            return ""  # of a vector of numbers, such as {1, 2}
         return f"{entry(of, 1)}, or norm({of})" if isinstance(expr, Name) else f"norm({of})"
 
 
 def _is_vector(written: Written) -> bool:
+    """Return whether an expanded expression is a vector."""
     return written is not None and len(written) > 1
 
 
 def _size(written: tuple[Expr, ...]) -> str:
+    """Return the text of the size of an expanded expression."""
     return f"a vector of {len(written)}" if _is_vector(written) else "a number"

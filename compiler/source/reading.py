@@ -1,21 +1,23 @@
-"""Reads typed values from YAML nodes; a node of the wrong type raises an error with a suggestion.
+"""Reading of typed values from YAML nodes; a node of the wrong type raises an error with a fix.
 
 Takes: nodes of the stage `source`. Gives: `MappingReader`, a mapping that is read key by key; `mapping_of`,
 `list_of`, `text_of`, `name_of`, `whole_number`, `among`; for messages `fault`, `unknown`, `form`, `brief`,
-`either_comma`.
+`named`, `either_comma`.
 Guarantees: a node of the wrong form is one mistake, an `ApcError` that `with mistakes:` records, so that
-reading goes on behind it.
-Does not: know any section, component or unit.
+the following nodes are read.
+Does not: handle sections, components or units.
 """
 
 from __future__ import annotations
 
 import re
+import unicodedata
 from collections.abc import Callable, Collection, Container
 from typing import TypeVar
 
-from apc.compiler.errors import ApcError, Diagnostic, Mistakes, SourceLocation, nearest, visible
+from apc.compiler.errors import ApcError, Diagnostic, Mistakes, SourceLocation, equally_near, nearest, visible
 from apc.compiler.source.nodes import Mapping, Node, Scalar, Sequence
+from apc.compiler.wording import enumerated
 
 T = TypeVar("T")
 D = TypeVar("D")
@@ -24,7 +26,7 @@ IDENTIFIER = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,62}\Z")
 
 
 def form(node: Node) -> str:
-    """Return the type of a node, in words, for a message."""
+    """Return the type of a node as text, for a message."""
     if isinstance(node, Mapping):
         return "a mapping"
     if isinstance(node, Sequence):
@@ -35,33 +37,46 @@ def form(node: Node) -> str:
 
 
 def either_comma(key: str, whole: str, digits: str, rest: str | None) -> str:
-    """Return the suggestion for a number with a comma: 0,5 is 0.5, and 1,500 may be 1500 as well."""
+    """Return the fixes for a number with a comma: 0,5 is 0.5, and 1,500 is either 1.500 or 1500."""
     decimal = f"{key}: {whole}.{digits}{rest or ''}"
     thousands = len(digits) == 3 and whole.lstrip("+-0")
     return f"{decimal}, or {key}: {whole}{digits}{rest or ''}" if thousands else decimal
 
 
 def brief(text: str) -> str:
-    """Return a text short enough for one line of a message."""
+    """Return a text shortened to at most 60 characters of one line, for a message."""
     flat = " ".join(text.split())
     return visible(flat if len(flat) <= 60 else flat[:57] + "...")
 
 
+def named(text: str) -> str:
+    """Return a short name for a message, with the first character that is not ASCII spelled out."""
+    foreign = next((character for character in text if not character.isascii()), "")
+    spelled = f" (U+{ord(foreign):04X}, {unicodedata.name(foreign, 'unnamed character')})" if foreign else ""
+    return brief(text) + spelled
+
+
 def fault(
-    code: str, location: SourceLocation, message: str, expected: str = "", got: str = "", hint: str = ""
+    code: str,
+    location: SourceLocation,
+    message: str,
+    expected: str = "",
+    got: str = "",
+    fix: str = "",
+    advice: str = "",
 ) -> ApcError:
     """Return an error with one diagnostic, for the caller to raise.
 
     Parameters
     ----------
-    code, location, message, expected, got, hint
+    code, location, message, expected, got, fix, advice
         The fields of the `Diagnostic`.
     """
-    return ApcError(Diagnostic(code, location, message, expected, got, hint))
+    return ApcError(Diagnostic(code, location, message, expected, got, fix, advice))
 
 
-def mapping_of(node: Node, subject: str, hint: str = "") -> Mapping:
-    """Return a node, checked to be a mapping.
+def mapping_of(node: Node, subject: str, fix: str = "") -> Mapping:
+    """Return a node if it is a mapping.
 
     Parameters
     ----------
@@ -69,37 +84,40 @@ def mapping_of(node: Node, subject: str, hint: str = "") -> Mapping:
         The node.
     subject
         The name of the value, for the message.
-    hint
-        The line to write instead.
+    fix
+        The fix.
 
     Raises
     ------
     ApcError
-        E203 the node is no mapping.
+        E203 the node is not a mapping.
     """
     if isinstance(node, Mapping):
         return node
-    raise fault("E203", node.location, subject, "a mapping of keys to values", form(node), hint)
+    raise fault("E203", node.location, subject, "a mapping of keys to values", form(node), fix)
 
 
-def text_of(node: Node, subject: str, hint: str = "") -> str:
-    """Return the text of a scalar that isn't empty; arguments and error as for `mapping_of`."""
+def text_of(node: Node, subject: str, fix: str = "") -> str:
+    """Return the text of a scalar that is not empty; arguments and error as for `mapping_of`."""
     if isinstance(node, Scalar) and node.text.strip() and node.value is not None:
         return node.text
-    raise fault("E203", node.location, subject, "a single value", form(node), hint)
+    raise fault("E203", node.location, subject, "a single value", form(node), fix)
 
 
 def list_of(node: Node, subject: str, size: int, item: str) -> tuple[Node, ...]:
-    """Return the items of a list of `size` items; `item` is an example for the message. Raises E203."""
+    """Return the items of a list node with `size` items; `item` is an example for the message.
+
+    Raises E203.
+    """
     if isinstance(node, Sequence) and len(node.items) == size:
         return node.items
-    got = f"{len(node.items)}" if isinstance(node, Sequence) else form(node)
-    hint = f"{subject}: [{', '.join([item] * size)}]"
-    raise fault("E203", node.location, subject, f"a list of {size} values", got, hint)
+    got = f"a list of {len(node.items)}" if isinstance(node, Sequence) else form(node)
+    fix = f"{subject}: [{', '.join([item] * size)}]"
+    raise fault("E203", node.location, subject, f"a list of {size} values", got, fix)
 
 
 def whole_number(node: Node) -> int | None:
-    """Return the whole number that a scalar is; None if it is none, as `true` or one in quotes."""
+    """Return the integer value of a scalar; None for other nodes, such as `true` or a quoted number."""
     value = node.value if isinstance(node, Scalar) else None
     return value if isinstance(value, int) and not isinstance(value, bool) else None
 
@@ -107,28 +125,28 @@ def whole_number(node: Node) -> int | None:
 def name_of(
     key: Scalar, subject: str, used: Container[str] = (), whole: str = "", words: Container[str] = ()
 ) -> str:
-    """Return the text of a scalar that can serve as a name: a letter, then letters, digits, underscores.
+    """Return the text of a scalar that is a valid name: a letter, then letters, digits and underscores.
 
     Parameters
     ----------
     key, subject
-        The scalar, and the noun for the named thing, for the message.
+        The scalar, and the noun for the named item, for the message.
     used, whole
-        The names already in use, and the section that has them.
+        The names already in use, and the text for their context.
     words
-        The words of the language, which can't be names.
+        The reserved words of the language.
 
     Raises
     ------
     ApcError
-        E205 if it can't.
+        E205 the text is not a valid name, or is already used.
     """
     name = key.text
     if not IDENTIFIER.match(name):
         expected = "a letter followed by letters, digits or underscores (63 at most)"
-        raise fault("E205", key.location, f"the name of {subject}", expected, brief(name) or "nothing")
+        raise fault("E205", key.location, f"name of {subject}", expected, brief(name) or "nothing")
     if name in words:
-        raise fault("E205", key.location, f"{name} is a word of the language and can't be a name")
+        raise fault("E205", key.location, f"{name} is a reserved word and can't be a name")
     if name in used:
         raise fault("E205", key.location, f"the name {name} is used twice in {whole}")
     return name
@@ -139,78 +157,92 @@ RENAMED = {"about": "description", "above": "exclusive_min"}
 
 
 class MappingReader:
-    """A mapping that is read key by key; a value at fault is recorded and reads as one that isn't there.
+    """A mapping that is read key by key; an invalid value is recorded and read as missing.
 
-    A key that isn't allowed is recorded, with the nearest allowed one, and reads as the one it was meant to
-    be, so that one slip is not reported a second time as something missing.
+    An invalid key is recorded, with the nearest valid key, and its value is read as the value of the nearest
+    key, so that a misspelled key is not reported a second time as a missing one.
     """
 
     def __init__(self, node: Mapping, allowed: Collection[str], subject: str, mistakes: Mistakes) -> None:
-        """Initialize with a mapping, its valid keys, its name for messages, and the collector of E202."""
+        """Read the keys of a mapping; invalid keys (not in `allowed`) are recorded (E202)."""
         self.location = node.location
         self.mistakes = mistakes
         self.nodes = {key.text: value for key, value in node.entries}
         for key, value in node.entries:
             if key.text not in allowed:
                 if (renamed := RENAMED.get(key.text, "")) in allowed:
-                    text = f"{subject} has no key {key.text}: it is named {renamed} now"
-                    mistakes.take(fault("E202", key.location, text, hint=renamed))
+                    text = f"unknown key {key.text} in {subject}; its present name is {renamed}"
+                    mistakes.take(fault("E202", key.location, text, fix=renamed))
                     self.nodes.setdefault(renamed, value)
                     continue
-                left = [known for known in allowed if known not in self.nodes]  # what is there was meant
-                close = nearest(key.text, left)
-                text = f"{subject} has no key {brief(key.text)}"
+                unused = [
+                    known for known in allowed if known not in self.nodes
+                ]  # keys present in the mapping are not misspelled
+                close = nearest(key.text, unused)
+                text = f"unknown key {named(key.text)} in {subject}"
                 mistakes.take(unknown("E202", key.location, text, close, [close] if close else allowed))
                 if close:
                     self.nodes.setdefault(close, value)
 
     def read(self, key: str, reader: Callable[[Node, str], T], default: D) -> T | D:
-        """Return the result of a reader for the value of a key; the reader also gets the key."""
+        """Return the result of a reader for the value of a key, else `default`.
+
+        The reader also gets the key.
+        """
         if (node := self.nodes.get(key)) is not None:
             with self.mistakes:
                 return reader(node, key)
         return default
 
-    def text(self, key: str, hint: str = "") -> str:
-        """Return the text of a key, empty without one."""
-        return self.read(key, lambda node, _: text_of(node, key, hint), "")
+    def text(self, key: str, fix: str = "") -> str:
+        """Return the text of a key, empty if there is none."""
+        return self.read(key, lambda node, _: text_of(node, key, fix), "")
 
-    def section(self, key: str, hint: str) -> tuple[tuple[Scalar, Node], ...]:
-        """Return the entries of the mapping of a key; `hint` is the suggestion otherwise."""
-        return self.read(key, lambda node, _: mapping_of(node, key, f"{key}: {hint}").entries, ())
+    def section(self, key: str, fix: str) -> tuple[tuple[Scalar, Node], ...]:
+        """Return the entries of the mapping of a key, empty if missing or invalid; `fix` is for messages."""
+        return self.read(key, lambda node, _: mapping_of(node, key, f"{key}: {fix}").entries, ())
 
-    def each(self, key: str, hint: str, reader: Callable[[Scalar, Node], T]) -> list[T]:
-        """Return the results of a reader for the entries of a section, each with its key."""
+    def each(self, key: str, fix: str, reader: Callable[[Scalar, Node], T]) -> list[T]:
+        """Return the results of a reader for the entries of a section.
+
+        Invalid entries are recorded and omitted.
+        """
         result = []
-        for name, node in self.section(key, hint):
+        for name, node in self.section(key, fix):
             with self.mistakes:
                 result.append(reader(name, node))
         return result
 
 
 def unknown(code: str, location: SourceLocation, subject: str, name: str, texts: Collection[str]) -> ApcError:
-    """Return the mistake of an unknown name, with the nearest known one or, failing that, a list of them.
+    """Return the error for an unknown name, with the nearest known name, or with a list of known names.
 
     Parameters
     ----------
     code, location, subject
-        The mistake's code, where it is, and its first words.
+        The code and location of the error, and the start of its message.
     name
         The name as written.
     texts
-        The names there are.
+        The known names.
     """
     close = nearest(name, texts)
+    if len(equal := equally_near(name, close, texts)) > 1:
+        return fault(
+            code, location, f"{subject}; the nearest are {enumerated(equal)}", fix=", or ".join(equal)
+        )
     if close:
-        return fault(code, location, f"{subject}; the nearest is {close}", hint=close)
+        return fault(code, location, f"{subject}; the nearest is {close}", fix=close)
     listed = ", ".join(list(texts)[:12]) + (", …" if len(texts) > 12 else "")
-    return fault(code, location, f"{subject}; there are: {listed}" if listed else f"{subject}; there is none")
+    return fault(
+        code, location, f"{subject}; available: {listed}" if listed else f"{subject}; none is defined"
+    )
 
 
 def among(
     name: str, texts: Collection[str], location: SourceLocation, subject: str, code: str = "E206"
 ) -> str:
-    """Return a known name.
+    """Return a name if it is a known name.
 
     Parameters
     ----------
@@ -226,4 +258,4 @@ def among(
     """
     if name in texts:
         return name
-    raise unknown(code, location, subject.replace("{}", brief(name)), name, texts)
+    raise unknown(code, location, subject.replace("{}", named(name)), name, texts)

@@ -1,9 +1,9 @@
-"""A file, or its bytes, to the YAML nodes in it.
+"""Reading of a YAML file or its bytes to nodes.
 
 Takes: a path, or bytes.
 Gives: `read_source`, `parse_source`: a `Source`, the text and its tree of nodes.
 Guarantees: a regular file of bounded size (see `files`), UTF-8 without control characters, one YAML document.
-Does not: know what a topology is, or what any key means.
+Does not: interpret keys.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from apc.compiler.source.nodes import MAX_BYTES, Lines, Node
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """A text that was read: `file` is its name in messages."""
+    """A text with its tree of nodes: `file` is its name in messages."""
 
     file: str
     path: Path | None
@@ -30,20 +30,20 @@ class Source:
 
 
 def read_source(path: Path, *, shown: str | None = None) -> Source:
-    """Read a YAML file.
+    """Return the text and nodes of a YAML file.
 
     Parameters
     ----------
     path
         The file.
     shown
-        Its name in messages; the path as given by default.
+        The name of the file in messages; by default the path.
 
     Raises
     ------
     ApcError
-        E101 no such file, E102 a folder, E103 not readable, E104 not a regular file;
-        and those of `parse_source`.
+        E101 a missing file, E102 a folder, E103 an unreadable file, E104 not a regular file;
+        and the errors of `parse_source`.
     """
     file = str(path) if shown is None else shown
     try:
@@ -54,24 +54,26 @@ def read_source(path: Path, *, shown: str | None = None) -> Source:
 
 
 def _not_read(path: Path, location: SourceLocation, refused: RefusedError) -> Diagnostic:
+    """Return the error of a file that could not be read."""
     match refused.why:
         case "missing":
             return Diagnostic("E101", location, _missing(path))
         case "folder" | "special":
             code = "E102" if refused.why == "folder" else "E104"
-            return Diagnostic(code, location, "this", "a YAML file", refused.words.removeprefix("is "))
+            return Diagnostic(code, location, "input", "a YAML file", refused.words.removeprefix("is "))
         case "large":
             return _too_large(location)
-    return Diagnostic("E103", location, f"this file {refused.words}")
+    return Diagnostic("E103", location, f"the file {refused.words}")
 
 
 def _too_large(location: SourceLocation) -> Diagnostic:
-    message = f"this file is larger than {MAX_BYTES} bytes, the most a YAML file may have here"
+    """Return the error E105 of a file that is too large."""
+    message = f"the file is larger than {MAX_BYTES} bytes, the limit for a YAML file"
     return Diagnostic("E105", location, message)
 
 
 def parse_source(data: bytes, *, file: str, path: Path | None = None) -> Source:
-    """Parse the bytes of a YAML file.
+    """Return the text and nodes of the bytes of a YAML file.
 
     Parameters
     ----------
@@ -85,10 +87,8 @@ def parse_source(data: bytes, *, file: str, path: Path | None = None) -> Source:
     Raises
     ------
     ApcError
-        E105 too large, E106 not UTF-8, E107 control character, E108 empty, E109 not YAML,
-        E110 several documents, E111 a key twice, E112 a key that is no name, E113 a tag,
-        E114 an alias without end or without anchor, E115 nested too deep, E116 a merge key,
-        E117 too many nodes.
+        E105 too many bytes, E106 not UTF-8, E107 a control character; and the errors of `compose`, E108 to
+        E117.
     """
     if len(data) > MAX_BYTES:
         raise ApcError(_too_large(SourceLocation(file)))
@@ -105,34 +105,36 @@ def _missing(path: Path) -> str:
     try:
         known = sorted(entry.name for entry in folder.iterdir())
     except OSError:
-        return f"there is no folder {str(folder)!r}"
+        return f"the folder {str(folder)!r} does not exist"
     close = nearest(path.name, known)
     return (
-        f"there is no such file; did you mean {str(folder / close)!r}?" if close else "there is no such file"
+        f"the file does not exist; did you mean {str(folder / close)!r}?"
+        if close
+        else "the file does not exist"
     )
 
 
 def _decode(data: bytes, file: str) -> str:
-    """Return the text without its byte order mark, or report the byte that is not UTF-8."""
+    """Return the text of UTF-8 bytes without byte order mark. Raises ApcError (E106) for an invalid byte."""
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        # With a mark in front, Python counts from behind it.
+        # If there is a byte order mark, Python's offset is relative to the byte after it.
         start = error.start + (len(data) - len(error.object))
         before = re.split(rb"\r\n|\n|\r", data[:start])
         line, column = len(before), len(before[-1].decode("utf-8-sig", "replace")) + 1
         got = f"byte 0x{data[start]:02x} at offset {start}"
         raise ApcError(
-            Diagnostic("E106", SourceLocation(file, line, column), "a YAML file", "UTF-8 text", got)
+            Diagnostic("E106", SourceLocation(file, line, column), "file", "UTF-8 text", got)
         ) from None
 
 
-# YAML's line breaks beyond LF and CR (U+0085, U+2028, U+2029) show in few editors: refused with the rest.
+# YAML's other line breaks (U+0085, U+2028, U+2029) are invisible in most editors, and are invalid too.
 _CONTROL = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\u2028\u2029\ufeff\ufffe\uffff]")
 
 
 def _refuse_control_characters(text: str, lines: Lines) -> None:
-    """Raise E107 for the first character that no editor shows."""
+    """Raise ApcError (E107) for the first invisible character."""
     if (search := _CONTROL.search(text)) is None:
         return
     before = re.split(r"\r\n|\n|\r", text[: search.start()])
@@ -140,4 +142,4 @@ def _refuse_control_characters(text: str, lines: Lines) -> None:
     name = unicodedata.name(character, "a control character")
     got = f"U+{ord(character):04X} ({name})" + (", as in a binary file" if character == "\0" else "")
     location = lines.location(len(before) - 1, len(before[-1]))
-    raise ApcError(Diagnostic("E107", location, "a YAML file", "visible text", got))
+    raise ApcError(Diagnostic("E107", location, "file", "text without control characters", got))

@@ -3,7 +3,7 @@
 Takes: the YAML nodes of `graph` and `delays`. Gives: `read_graph`, the `Graph` of a compiled model;
 `read_delays`, a `DelayDeclaration` per entry.
 Guarantees: every peer of an edge exists; weights are finite and not zero.
-Does not: build a matrix: a complete graph, a ring and a star are kept as words.
+Does not: build a matrix: a complete graph, a ring and a star are stored by name.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ from apc.compiler.topology.topology_parameters import NamedNumbers
 
 SHAPES = ("complete", "ring", "star")
 
-# What others call a graph in which each is joined to each.
-MEANING_COMPLETE = ("mesh", "full", "all", "clique")
+# Other common names of a complete graph.
+SYNONYMS_OF_COMPLETE = ("mesh", "full", "all", "clique")
 PAIRS = ("edges", "arcs")
 
 COMPLETE = Graph("complete", np.zeros((0, 2), np.int64), np.zeros(0))
@@ -37,7 +37,7 @@ COMPLETE = Graph("complete", np.zeros((0, 2), np.int64), np.zeros(0))
 
 @dataclass(frozen=True, slots=True)
 class DelayDeclaration:
-    """The delay of a link from one group of peers to another."""
+    """The delay of a link from one group of peers, `sender`, to another, `receiver`."""
 
     sender: str
     receiver: str
@@ -45,39 +45,42 @@ class DelayDeclaration:
 
 
 def read_graph(node: Node, numbers: NamedNumbers) -> Graph:
-    """Read `complete`, `ring`, `star`, `{edges: …}` or `{arcs: …}`.
+    """Return the communication graph of a link, from `complete`, `ring`, `star`, `{edges: …}` or `{arcs: …}`.
 
     Parameters
     ----------
     node
-        The node.
+        The YAML node of `graph`.
     numbers
-        Knows the groups, reads tables of arcs, and collects their errors.
+        The named numbers: counts of the groups, reader of tables, collector of errors.
 
     Raises
     ------
     ApcError
-        An invalid entry.
+        The entry is invalid; errors of single pairs are recorded.
     """
     mistakes, word = numbers.mistakes, node.text if isinstance(node, Scalar) else None
     if numbers.peers > MOST_PLACED and word != COMPLETE.shape:
-        expected = f"at most {MOST_PLACED:,} peers where it isn't complete"
-        raise fault("E208", node.location, "a graph", expected, f"{numbers.peers:,}", "graph: complete")
+        expected = f"at most {MOST_PLACED:,} peers unless complete"
+        raise fault("E208", node.location, "graph", expected, f"{numbers.peers:,}", "graph: complete")
     if word is not None and word in SHAPES:
         return replace(COMPLETE, shape=word)
     if word is not None:
-        message = f"there is no graph {brief(word)}"
-        if word.lower() in MEANING_COMPLETE:
-            raise fault("E206", node.location, message, hint=COMPLETE.shape)
+        message = f"unknown graph {brief(word)}"
+        if word.lower() in SYNONYMS_OF_COMPLETE:
+            raise fault("E206", node.location, message, fix=COMPLETE.shape)
         raise unknown("E206", node.location, message, word, (*SHAPES, *PAIRS))
-    hint = "[[1, 2], [2, 3]]"
-    body = MappingReader(mapping_of(node, "graph", f"graph: {{edges: {hint}}}"), PAIRS, "graph", mistakes)
-    if len(body.nodes) != 1:
-        raise fault("E203", node.location, "graph", "either edges or arcs", hint=f"edges: {hint}")
-    [(key, pairs)] = body.nodes.items()
-    if key not in PAIRS:
+    fix = "[[1, 2], [2, 3]]"
+    body = MappingReader(mapping_of(node, "graph", f"graph: {{edges: {fix}}}"), PAIRS, "graph", mistakes)
+    given = [key for key in PAIRS if key in body.nodes]
+    if body.nodes and not given:
         raise AlreadyReportedError
-    numbered = _peers(numbers.counts)
+    if len(given) != 1:
+        got, shown = ("both", "") if given else ("neither", f"edges: {fix}")
+        raise fault("E203", node.location, "graph", "edges or arcs", got, shown)
+    [key] = given
+    pairs = body.nodes[key]
+    numbered = _peer_indices(numbers.counts)
     if isinstance(pairs, Scalar) and pairs.text.endswith(".csv"):
         if "peers" in numbers.faulty:
             raise AlreadyReportedError
@@ -87,7 +90,7 @@ def read_graph(node: Node, numbers: NamedNumbers) -> Graph:
         items = pairs.items
     else:
         raise fault(
-            "E203", pairs.location, key, "a list of pairs or a .csv file", form(pairs), f"{key}: {hint}"
+            "E203", pairs.location, key, "a list of pairs or a .csv file", form(pairs), f"{key}: {fix}"
         )
     if "peers" in numbers.faulty:
         raise AlreadyReportedError
@@ -96,7 +99,13 @@ def read_graph(node: Node, numbers: NamedNumbers) -> Graph:
         with mistakes:
             sender, receiver, weight = _arc(pair, key, numbered, mistakes)
             if (sender, receiver) in result or (key == "edges" and (receiver, sender) in result):
-                raise fault("E213", pair.location, f"the pair {sender + 1}, {receiver + 1} is given twice")
+                message = f"the arc from peer {sender + 1} to peer {receiver + 1} is given twice"
+                if key == "edges":
+                    first, second = sorted((sender + 1, receiver + 1))
+                    message = f"the edge between peers {first} and {second} is given twice"
+                advice = "an edge has both directions: use arcs for single directions"
+                reverse = (sender, receiver) not in result
+                raise fault("E213", pair.location, message, advice=advice if reverse else "")
             result[sender, receiver] = weight
     if key == "edges":
         result |= {(receiver, sender): weight for (sender, receiver), weight in result.items()}
@@ -104,97 +113,119 @@ def read_graph(node: Node, numbers: NamedNumbers) -> Graph:
 
 
 def _read_pairs(path: Path, named_at: SourceLocation, numbered: Mapping[str, int]) -> tuple[Node, ...]:
-    """Return the rows of a table with the columns from, to and weight or none as pairs.
+    """Return the rows of a table of pairs as YAML nodes `[from, to]` or `[from, to, weight]`.
 
-    A peer is written by its number or by its name, as in YAML. Raises ApcError (E701 to E703).
+    A peer is written by its number or by its name, as in YAML; `numbered` has the index of each. Raises
+    ApcError (E701 to E703).
     """
 
     def peer(text: str) -> float:
+        """Return the number of a peer, from 1, written as number or name."""
         number = numbered.get(text.strip())
         return plain_float(text) if number is None else number + 1
 
     with open_table(path, named_at) as opened:
         names, location = [name for name, _, _ in opened.headings], opened.headings[0][2]
         if names not in (["from", "to"], ["from", "to", "weight"]):
-            expected = "the headings from, to and weight or none"
-            raise fault("E702", location, "a table of pairs", expected, brief(", ".join(names)))
+            expected = "the headings from, to and, optionally, weight"
+            raise fault("E702", location, "table of pairs", expected, brief(", ".join(names)))
         readers = (peer, peer, plain_float)[: len(names)]
         expected = f"a finite number, or the name of a peer such as {_example(numbered)} in from and to"
-        numbers, lines = opened.numbers(range(len(names)), readers, "a cell", expected)
+        numbers, lines = opened.numbers(range(len(names)), readers, "cell", expected)
     pairs = []
     for line, *row in zip(lines, *numbers.reshape(-1, len(names)).T.tolist(), strict=True):
-        at = SourceLocation(opened.file, line, 1)
+        row_location = SourceLocation(opened.file, line, 1)
         values = (int(number) if number.is_integer() else number for number in row)
-        pairs.append(Sequence(tuple(Scalar(str(value), value, True, at) for value in values), at))
+        pairs.append(
+            Sequence(tuple(Scalar(str(value), value, True, row_location) for value in values), row_location)
+        )
     return tuple(pairs)
 
 
 def _example(numbered: Mapping[str, int]) -> str:
-    """Return the name of a peer."""
+    """Return the name of one peer, as an example in messages."""
     return next((name for name in numbered if name.endswith("]")), "user[1]")
 
 
-def _peers(counts: Mapping[str, int]) -> dict[str, int]:
-    """Return the number of each peer, from 0, by how it is written: 1 to N, or left[2]."""
+def _peer_indices(counts: Mapping[str, int]) -> dict[str, int]:
+    """Return the zero-based index of each peer by its two spellings: its number from 1, and its name, such
+    as `left[2]`.
+    """
     names = [f"{group}[{number + 1}]" for group, count in counts.items() for number in range(count)]
     return {name: k for k, name in enumerate(names)} | {str(k + 1): k for k in range(len(names))}
 
 
-def _arc(pair: Node, subject: str, numbered: Mapping[str, int], mistakes: Mistakes) -> tuple[int, int, float]:
-    """Return the sender and the receiver of a pair, zero-based, and its weight."""
+def _arc(pair: Node, subject: str, index_of: Mapping[str, int], mistakes: Mistakes) -> tuple[int, int, float]:
+    """Return an arc of a list of pairs: the zero-based indices of sender and receiver, and the weight.
+
+    Parameters
+    ----------
+    pair, subject
+        The YAML node `[from, to]` or `[from, to, weight]`, and the key of the list for messages.
+    index_of
+        The index of each peer by its spellings.
+    mistakes
+        The collector of errors, for each invalid end.
+
+    Raises
+    ------
+    ApcError
+        The pair is invalid.
+    """
     if not isinstance(pair, Sequence) or len(pair.items) not in (2, 3):
-        expected = "two peers, and a weight if it isn't 1"
+        expected = "two peers and, optionally, a weight"
         raise fault("E203", pair.location, subject, expected, form(pair), "[1, 2]")
     ends: list[int] = []
     for node in pair.items[:2]:
         with mistakes:
             quoted = isinstance(node, Scalar) and node.text.isdigit() and not node.plain
             text = node.text if isinstance(node, Scalar) and not quoted else ""
-            if text not in numbered:
-                numbers = f"a number from 1 to {len(numbered) // 2}, or a name in quotes such as "
-                numbers += f'"{_example(numbered)}"'
-                raise fault("E213", node.location, "a peer", numbers, form(node))
-            ends.append(numbered[text])
+            if text not in index_of:
+                expected_peer = f"a number from 1 to {len(index_of) // 2}, or a name in quotes such as "
+                expected_peer += f'"{_example(index_of)}"'
+                raise fault("E213", node.location, "peer", expected_peer, form(node))
+            ends.append(index_of[text])
     weight = 1.0
     for node in pair.items[2:]:
         number = node.value if isinstance(node, Scalar) else None
         usable = isinstance(number, int | float) and not isinstance(number, bool)
         if not (usable and number and math.isfinite(float(number))):
-            raise fault("E203", node.location, "a weight", "a number other than 0", form(node), "0.5")
+            raise fault("E203", node.location, "weight", "a number other than 0", form(node), "0.5")
         weight = float(number)
     if len(ends) < 2:
         raise AlreadyReportedError
     if ends[0] == ends[1]:
-        raise fault("E213", pair.location, f"peer {ends[0] + 1} can't be joined to itself")
+        raise fault("E213", pair.location, f"peer {ends[0] + 1} can't be connected to itself")
     return ends[0], ends[1], weight
 
 
 def read_delays(node: Node, numbers: NamedNumbers) -> tuple[DelayDeclaration, ...]:
-    """Read `{SENDER: {RECEIVER: 12 ms}}`: the delays of pairs of groups that differ from the link's.
+    """Return the delays between pairs of groups that differ from the link's delay: `{SENDER: {RECEIVER:
+    12 ms}}`.
 
     Parameters
     ----------
     node
-        The mapping.
+        The YAML node of `delays`.
     numbers
-        Knows the groups, and reads a delay.
+        The named numbers: groups of peers, reader of delays, collector of errors.
 
     Raises
     ------
     ApcError
-        E203 it is no mapping; other mistakes are recorded.
+        E203 the node is not a mapping; other mistakes are recorded.
     """
-    topology_delays, subject = [], "delays names {}, which is no group of peers"
-    hint, counts = "delays: {left: {right: 12 ms}}", numbers.counts
-    for key, body in mapping_of(node, "delays", hint).entries:
+    declarations, subject = [], "delays: unknown group of peers {}"
+    fix, counts = "delays: {left: {right: 12 ms}}", numbers.counts
+    for key, body in mapping_of(node, "delays", fix).entries:
         with numbers.mistakes:
             sender = among(key.text, counts, key.location, subject)
-            for inner, value in mapping_of(body, sender, hint).entries:
+            for inner, value in mapping_of(body, sender, fix).entries:
                 with numbers.mistakes:
                     receiver = among(inner.text, counts, inner.location, subject)
-                    text_of(value, receiver, hint)
-                    delay = numbers.read(value, f"the delay from {sender} to {receiver}", SECOND, "ms")
+                    text_of(value, receiver, fix)
+                    delay = numbers.read(value, f"delay from {sender} to {receiver}", SECOND, "ms")
                     if delay.number < 0:
-                        raise fault("E207", delay.location, "a delay", "0 s or more", str(delay))
-                    topology_delays.append(DelayDeclaration(sender, receiver, delay))
-    return tuple(topology_delays)
+                        raise fault("E207", delay.location, "delay", "0 s or more", str(delay))
+                    declarations.append(DelayDeclaration(sender, receiver, delay))
+    return tuple(declarations)

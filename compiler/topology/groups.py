@@ -2,11 +2,11 @@
 
 Takes: the `peers` section. Gives: `read_counts`, a `GroupBody` per group; `GroupReader`, a `GroupDeclaration`
 per group once the parts are known.
-Guarantees: a list or table of settings has one value a peer, each with the right unit and within bounds; a
-number inside a part that is an expression over one the group sets has the group's value, within its bounds,
-and keeps its expression; what the group sets itself stays.
-Does not: know sections other than `peers`; follow numbers that differ from peer to peer: whoever reads
-columns computes what depends on them.
+Guarantees: a list or table of settings has one value per peer, with the right unit and within bounds. A
+number inside a part that is an expression over a number set by the group has the value for this group, within
+its bounds, and keeps its expression; numbers set by the group remain.
+Does not: read sections other than `peers`; compute the numbers that depend on columns: the reader of the
+columns computes them for each peer.
 """
 
 from __future__ import annotations
@@ -72,7 +72,10 @@ Columns = tuple[tuple[str, NDArray[np.float64]], ...]
 
 @dataclass(frozen=True, slots=True)
 class GroupBody:
-    """A group before its settings are read; `counted` is its count where that follows from named numbers."""
+    """A group before its settings are read: its name, count and mapping, and its table, if any.
+
+    `counted` is the value of the count if the count is an expression, else None.
+    """
 
     name: str
     count: int
@@ -83,12 +86,12 @@ class GroupBody:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GroupDeclaration:
-    """`count` peers.
+    """A group of `count` peers.
 
-    `values` are the group's own settings by whole name (`contact.stiffness`) and what follows from them
-    inside parts, `words` its own options and clocks, `columns` settings that differ from peer to peer,
-    `counted` its count where that follows from named numbers, `types` the parts of another type, all of whose
-    numbers are the group's own.
+    `values` has the numbers set by the group and the numbers that depend on them inside parts, by qualified
+    name (`contact.stiffness`); `words` its options and clocks; `columns` the settings with one value per
+    peer; `counted` its count if that is an expression; `types` the parts with another component type, with
+    all their numbers in `values`.
     """
 
     name: str
@@ -102,7 +105,7 @@ class GroupDeclaration:
 
 
 def read_counts(root: MappingReader, files: NamedFiles) -> dict[str, GroupBody]:
-    """Read the number of peers of each group.
+    """Return the groups of peers by name, with the number of peers of each.
 
     A group has a `count`, or a `table` with one row per peer, or lists in `set` with one value per peer.
 
@@ -111,22 +114,22 @@ def read_counts(root: MappingReader, files: NamedFiles) -> dict[str, GroupBody]:
     root
         The topology.
     files
-        Reads its tables.
+        The reader of the topology's tables.
     """
     result: dict[str, GroupBody] = {}
     example = "{user: {count: 3}}"
     section, peers = root.section("peers", example), root.nodes.get("peers")
     if isinstance(peers, MappingNode) and not section:
-        root.mistakes.add("E201", peers.location, "peers names no group", hint=f"peers: {example}")
+        root.mistakes.add("E201", peers.location, "peers: no group is defined", fix=f"peers: {example}")
     with root.mistakes:
         if peers is not None and len(section) > MOST_GROUPS:
-            hint = "one group, {table: users.csv}, with a row a peer"
+            advice = "use one group with {table: users.csv} and one row for each peer"
             got = f"{len(section):,}"
-            raise fault("E208", peers.location, "peers", f"at most {MOST_GROUPS} groups", got, hint)
+            raise fault("E208", peers.location, "peers", f"at most {MOST_GROUPS} groups", got, advice=advice)
         for key, value in section:
             with root.mistakes:
                 name = name_of(key, "a group of peers")
-                group = "user" if name == "count" else name  # a number of peers instead of a group
+                group = "user" if name == "count" else name  # `peers: {count: 3}` has no name of a group
                 number = value.text if isinstance(value, Scalar) and value.text.isdecimal() else "3"
                 node = mapping_of(value, name, f"{group}: {{count: {number}}}")
                 body = MappingReader(node, GROUP, f"group {name}", root.mistakes)
@@ -140,8 +143,23 @@ def read_counts(root: MappingReader, files: NamedFiles) -> dict[str, GroupBody]:
     return result
 
 
-def _count(name: str, body: MappingReader, table: Table | None, counted: ScalarValue | None) -> int:
-    """Return the number of peers of a group from its count, its table or its lists."""
+def _count(name: str, body: MappingReader, table: Table | None, computed: ScalarValue | None) -> int:
+    """Return the number of peers of a group, from its count, its table or its lists.
+
+    Parameters
+    ----------
+    name, body
+        The name of the group, and its mapping in the topology.
+    table
+        The table with one row per peer, if any.
+    computed
+        The value of the count if that is an expression, else None.
+
+    Raises
+    ------
+    ApcError
+        The group has no valid count.
+    """
     node, settings = body.nodes.get("count"), body.nodes.get("set")
     if node is None:
         if table is not None:
@@ -151,17 +169,17 @@ def _count(name: str, body: MappingReader, table: Table | None, counted: ScalarV
                 return len(value.items)
         if "table" in body.nodes:
             raise AlreadyReportedError
-        raise fault("E201", body.location, f"group {name} has no count", hint="count: 3")
+        raise fault("E201", body.location, f"group {name} has no count", fix="count: 3")
     count, got = whole_number(node), form(node)
-    if counted is not None:
-        count = int(counted.number) if counted.number.denominator == 1 else None
-        got += f", which is {float(counted.number):.12g}"
+    if computed is not None:
+        count = int(computed.number) if computed.number.denominator == 1 else None
+        got += f", which is {float(computed.number):.12g}"
     if count is None or not 1 <= count <= LARGEST_COUNT:
         expected = f"a whole number from 1 to {LARGEST_COUNT}"
         raise fault("E208", node.location, "count", expected, got, "count: 3")
     if table is not None and table.rows != count:
         message = f"group {name} has a count of {count} and a table of {table.rows} rows"
-        raise fault("E208", node.location, message, hint=f"count: {table.rows}")
+        raise fault("E208", node.location, message, fix=f"count: {table.rows}")
     return count
 
 
@@ -169,9 +187,9 @@ def _count(name: str, body: MappingReader, table: Table | None, counted: ScalarV
 class GroupReader:
     """Reads the settings of groups.
 
-    `settable` are the settable declarations, by the name in the topology; `parts` are all parts of the
-    topology, each before the parts inside it; `redeclared` are the names of parts with another type at a
-    group, by group; `explain` raises a more specific error for a name that can't be set, if there is one.
+    `settable` has the settable declarations by written name; `parts` are all parts of the topology, an outer
+    part before its inner parts; `redeclared` are the names of parts with another type at a group, by group;
+    `explain` raises a more specific error for a name that a group can't set, if there is one.
     """
 
     settable: SettableNames
@@ -182,40 +200,49 @@ class GroupReader:
     explain: Callable[[str, SourceLocation], None]
 
     def read(self, group: GroupBody) -> GroupDeclaration:
-        """Read the settings of a group, and their dependent values."""
+        """Return the declaration of a group: its settings, and the numbers that depend on them."""
         values: dict[str, ScalarValue] = {}
         words: dict[str, str] = {}
         columns: dict[str, NDArray[np.float64]] = {}
         mistakes, table = self.numbers.mistakes, group.table
         for key, node in self._entry_by_entry(group):
             with mistakes:
-                message = f"set names {brief(key.text)}, which is no parameter or variable of a part"
+                message = f"set: {brief(key.text)} is not a parameter or variable of a part"
                 if isinstance(node, MappingNode) and any(part.name == key.text for part in self.parts):
                     pairs = [
-                        (local.text, scalar.text)
-                        for local, scalar in node.entries
+                        (parameter.text, scalar.text)
+                        for parameter, scalar in node.entries
                         if isinstance(scalar, Scalar)
                     ]
-                    hint = ", ".join(f"{key.text}.{name}: {value}" for name, value in pairs)
-                    raise fault("E206", key.location, message, hint=hint)
-                item, wholes = self._settable(key.text, key.location, group.name, "E206", message)
+                    fix = ", ".join(f"{key.text}.{name}: {value}" for name, value in pairs)
+                    raise fault("E206", key.location, message, fix=fix)
+                if listed := [name for name in self.settable if name.startswith(f"{key.text}.")]:
+                    message = f"set: {brief(key.text)} is a part, not a parameter"
+                    raise unknown("E206", key.location, message, "", listed)
+                item, qualified_names = self._settable(key.text, key.location, group.name, "E206", message)
                 if isinstance(item, Option | Reference):
-                    words |= dict.fromkeys(wholes, self._word(node, key.text, item))
+                    words |= dict.fromkeys(qualified_names, self._word(node, key.text, item))
                 elif isinstance(node, Sequence):
-                    columns |= dict.fromkeys(wholes, self._listed(node, key.text, item, group.count))
+                    columns |= dict.fromkeys(
+                        qualified_names, self._per_peer_values(node, key.text, item, group.count)
+                    )
                 else:
-                    values |= dict.fromkeys(wholes, self.numbers.read_for(node, key.text, item))
+                    values |= dict.fromkeys(qualified_names, self.numbers.read_for(node, key.text, item))
         for column in () if table is None else table.columns:
             with mistakes:
-                message = f"a heading names {brief(column.name)}, which is no number of a part"
-                item, wholes = self._settable(column.name, column.location, group.name, "E702", message)
-                for whole in wholes:
+                message = f"heading {brief(column.name)} is not a parameter or variable of a part"
+                item, qualified_names = self._settable(
+                    column.name, column.location, group.name, "E702", message
+                )
+                for whole in qualified_names:
                     if whole in columns or whole in values:
-                        mistakes.add("E702", column.location, f"{whole} is given by set and by the table")
-                columns |= dict.fromkeys(wholes, column.numbers)
+                        mistakes.add(
+                            "E702", column.location, f"{whole} is given both by set and by the table"
+                        )
+                columns |= dict.fromkeys(qualified_names, column.numbers)
                 assert table is not None and isinstance(item, NumberParameter | ComponentVariable)
                 _check_column(column, table.lines, item, mistakes)
-        self._add_followers(values, words, columns, group)
+        self._add_dependent_values(values, words, columns, group)
         types = {}
         for part in self._parts_at(group):
             if group.name in self.redeclared.get(whole_and_index(part.name.partition(".")[0])[0], ()):
@@ -225,125 +252,172 @@ class GroupReader:
                     if (whole := f"{part.name}.{name}") not in columns:
                         values.setdefault(whole, value)
         settings = tuple(values.items()), tuple(words.items()), tuple(columns.items())
-        location, local_types = group.body.location, tuple(types.items())
-        return GroupDeclaration(group.name, group.count, *settings, location, group.counted, local_types)
+        location, changed_types = group.body.location, tuple(types.items())
+        return GroupDeclaration(group.name, group.count, *settings, location, group.counted, changed_types)
 
     def _parts_at(self, group: GroupBody) -> list[PartInstance]:
-        """Return the parts that a group's peers have."""
+        """Return the parts of a group's peers."""
         return [part for part in self.parts if group.name in part.groups]
 
     def _settable(
         self, name: str, location: SourceLocation, group: str, code: str, message: str
     ) -> tuple[Settable, list[str]]:
-        """Return the meaning of a name, with its qualified names; in a heading (E702) only a number."""
+        """Return the declaration of a settable name, and the qualified names it represents.
+
+        Parameters
+        ----------
+        name, location, group
+            The name, its location, and the group that sets it.
+        code, message
+            The error for an unknown name. A heading of a table (E702) can name only a number.
+
+        Raises
+        ------
+        ApcError
+            The name is unknown, or belongs to a part that the group does not have.
+        """
         kinds = (
             (NumberParameter, ComponentVariable)
             if code == "E702"
             else (NumberParameter, ComponentVariable, Option, Reference)
         )
-        item, wholes = self.settable.get(name, (None, []))
-        if not isinstance(item, kinds):
+        declaration, qualified_names = self.settable.get(name, (None, []))
+        if not isinstance(declaration, kinds):
             self.explain(name, location)
-            known = [known for known, (other, _) in self.settable.items() if isinstance(other, kinds)]
+            known = [written for written, (other, _) in self.settable.items() if isinstance(other, kinds)]
             known += [f"{part.name}.type" for part in self.parts if code == "E206" and "." not in part.name]
             raise unknown(code, location, message, name, known)
-        part = wholes[0].rpartition(".")[0]
-        at = [name for item in self.parts if item.name == part for name in item.groups]
+        part = qualified_names[0].rpartition(".")[0]
+        at = [where for owner in self.parts if owner.name == part for where in owner.groups]
         if at and group not in at:
-            message = f"{group} sets {name} and has no {part}, which is at {', '.join(at)}"
-            raise fault("E211", location, message, hint=f"at: [{', '.join((*at, group))}]")
-        return item, wholes
+            message = f"{group} sets {name}, but {part} is only at {', '.join(at)}"
+            raise fault("E211", location, message, fix=f"at: [{', '.join((*at, group))}]")
+        return declaration, qualified_names
 
     def _entry_by_entry(self, group: GroupBody) -> Iterator[tuple[Scalar, Node]]:
-        """Yield the settings of a group, a vector by its entries.
+        """Yield the settings of a group as key and value, a vector as its entries.
 
-        A list of a vector's entries is that vector at each peer; a list of such lists has one a peer.
+        A list of a vector's entries is the vector of every peer; a list of vectors has one vector per peer.
         """
         for key, node in group.body.section("set", "{device.mass: 0.2 kg}"):
             if group.name in self.redeclared.get(key.text.removesuffix(".type"), ()):
-                continue  # it was read before the parts
+                continue  # component types were read before the parts
             size = next((k for k in reversed(SIZES) if entry(key.text, k) in self.settable), 0)
             if not size:
                 yield key, node
                 continue
-            item, _ = self.settable[entry(key.text, 1)]
-            assert isinstance(item, NumberParameter | ComponentVariable)
-            text = f"1 {item.unit.text}".removesuffix(" 1")
-            nested = isinstance(node, Sequence) and any(isinstance(item, Sequence) for item in node.items)
+            declaration, _ = self.settable[entry(key.text, 1)]
+            assert isinstance(declaration, NumberParameter | ComponentVariable)
+            text = f"1 {declaration.unit.text}".removesuffix(" 1")
+            nested = isinstance(node, Sequence) and any(
+                isinstance(declaration, Sequence) for declaration in node.items
+            )
             if not nested and group.table is None and "count" not in group.body.nodes:
                 message = (
-                    f"{key.text} is a vector of {size}, and its list doesn't tell how many peers there are"
+                    f"group without a count: the list of {key.text}, a vector of {size}, does not define one"
                 )
-                self.numbers.mistakes.add("E201", node.location, message, hint="count: 3")
+                self.numbers.mistakes.add("E201", node.location, message, fix="count: 3")
             with self.numbers.mistakes:
                 rows = node.items if nested and isinstance(node, Sequence) else (node,)
                 columns = zip(*(list_of(row, key.text, size, text) for row in rows), strict=True)
                 for name, column in zip(entries(key.text, size), columns, strict=True):
                     yield replace(key, text=name), Sequence(column, node.location) if nested else column[0]
 
-    def _word(self, node: Node, subject: str, item: Option | Reference) -> str:
-        """Read an option, or the name of a clock."""
-        role, known = ("option", item.words) if isinstance(item, Option) else ("clock", self.clocks)
+    def _word(self, node: Node, subject: str, declaration: Option | Reference) -> str:
+        """Return the option or the clock named by a node. Raises ApcError for an unknown word."""
+        role, known = (
+            ("option", declaration.words) if isinstance(declaration, Option) else ("clock", self.clocks)
+        )
         word = text_of(node, subject, f"{subject}: {next(iter(known), 'name')}")
-        return among(word, known, node.location, f"{subject} has no {role} {{}}")
+        return among(word, known, node.location, f"{subject}: unknown {role} {{}}")
 
-    def _listed(self, node: Sequence, subject: str, item: Settable, count: int) -> NDArray[np.float64]:
-        """Read a list with a number a peer."""
+    def _per_peer_values(
+        self, node: Sequence, subject: str, declaration: Settable, count: int
+    ) -> NDArray[np.float64]:
+        """Return the values (count,) of a list with one number per peer, in SI units.
+
+        `declaration` has the unit and the bounds of the numbers; `subject` is their name for messages.
+        """
         if len(node.items) != count:
-            expected, got = f"a value a peer, {count} in all", f"{len(node.items)}"
-            raise fault("E208", node.location, f"the list of {subject}", expected, got)
+            expected, got = f"{count} values, one for each peer", f"{len(node.items)}"
+            raise fault("E208", node.location, f"list of {subject}", expected, got)
         return np.array(
-            [float(self.numbers.read_for(candidate, subject, item).number) for candidate in node.items]
+            [
+                float(self.numbers.read_for(entry_node, subject, declaration).number)
+                for entry_node in node.items
+            ]
         )
 
-    def _add_followers(
+    def _add_dependent_values(
         self,
         values: dict[str, ScalarValue],
         words: dict[str, str],
         columns: Collection[str],
         group: GroupBody,
     ) -> None:
-        """Add the values that depend on a group's settings, inside the affected parts."""
+        """Add the numbers and clocks inside a group's parts that depend on the settings of the group.
+
+        Parameters
+        ----------
+        values, words
+            The numbers and the options and clocks of the group, by qualified name; the dependent ones are
+            added.
+        columns
+            The qualified names with one value per peer, which are omitted.
+        group
+            The group.
+        """
         known: dict[str, ScalarValue] = {}
         location = group.body.location
         for part in self._parts_at(group):
             known |= {f"{part.name}.{name}": value for name, value in (*part.values, *part.starts)}
-            for inner in part.component.inner:  # which takes its clocks over from the outer part
-                for local, outer in inner.entry.references:
+            for inner in part.component.inner:  # an inner part has the clocks of the outer part
+                for reference, outer in inner.entry.references:
                     if (word := words.get(f"{part.name}.{outer}")) is not None:
-                        words.setdefault(f"{part.name}.{inner.name}.{local}", word)
+                        words.setdefault(f"{part.name}.{inner.name}.{reference}", word)
 
         def number(parts: tuple[str, ...]) -> Fraction:
+            """Return the number of a name: set by the group, else of a part, else of the topology."""
             value = values.get(name := ".".join(parts), known.get(name))
             return self.numbers.number(parts) if value is None else value.number
 
-        for whole, value in known.items():  # of an outer part before those inside it
+        for (
+            qualified,
+            value,
+        ) in known.items():  # the numbers of an outer part come before those of its inner parts
             tree = value.expression
-            if tree is None or whole in values or whole in columns:
+            if tree is None or qualified in values or qualified in columns:
                 continue
             if any(".".join(node.parts) in values for node in names(tree)):
                 with self.numbers.mistakes:
-                    follows = Fraction(evaluate(tree, number, location))
-                    values[whole] = replace(value, number=follows, location=location)
-                    if isinstance(item := self.settable[whole][0], NumberParameter):
-                        item.bounds.check(values[whole], whole, self.numbers.mistakes)
+                    new_number = Fraction(evaluate(tree, number, location))
+                    values[qualified] = replace(value, number=new_number, location=location)
+                    if isinstance(item := self.settable[qualified][0], NumberParameter):
+                        item.bounds.check(values[qualified], qualified, self.numbers.mistakes)
 
 
 def _check_column(
-    column: CsvColumn, lines: tuple[int, ...], item: NumberParameter | ComponentVariable, mistakes: Mistakes
+    column: CsvColumn,
+    lines: tuple[int, ...],
+    declaration: NumberParameter | ComponentVariable,
+    mistakes: Mistakes,
 ) -> None:
-    """Check a column's unit, and each of its numbers against the parameter's bounds."""
-    dimension, due = column.unit.dimension, item.unit.dimension
-    if dimension != due or dimension.clashes(due):
-        expected = format_dimension(due)
+    """Check the unit of a column of a table, and its numbers against the bounds of their declaration.
+
+    `lines` are the lines of the rows in the file. Raises ApcError E702 for a wrong unit; wrong numbers are
+    added to `mistakes`.
+    """
+    dimension, required = column.unit.dimension, declaration.unit.dimension
+    if dimension != required or dimension.clashes(required):
+        expected = format_dimension(required)
         got = f"[{column.unit.text}]" if column.unit.text != "1" else "no unit"
-        hint = f"{column.name} [{item.unit.text}]"
-        if dimension.clashes(due):
-            hint += f", each {'divided by' if expected == 'Hz' else 'times'} 2*pi"
-        raise fault("E702", column.location, f"the heading {column.name}", f"[{expected}]", got, hint)
-    if isinstance(item, NumberParameter):
-        bounds, rows = item.bounds, zip(lines, map(Fraction, column.numbers.tolist()), strict=True)
-        wrong = ((line, number) for line, number in rows if bounds.fault(number))
-        for line, number in islice(wrong, MOST_FAULTS):
-            value = ScalarValue(number, due, None, SourceLocation(column.location.file, line, 1))
+        fix, advice = f"{column.name} [{declaration.unit.text}]", ""
+        if dimension.clashes(required):
+            advice = f"{'divide' if expected == 'Hz' else 'multiply'} each number by 2*pi"
+        raise fault("E702", column.location, f"heading {column.name}", f"[{expected}]", got, fix, advice)
+    if isinstance(declaration, NumberParameter):
+        bounds, rows = declaration.bounds, zip(lines, map(Fraction, column.numbers.tolist()), strict=True)
+        invalid = ((line, number) for line, number in rows if bounds.fault(number))
+        for line, number in islice(invalid, MOST_FAULTS):
+            value = ScalarValue(number, required, None, SourceLocation(column.location.file, line, 1))
             bounds.check(value, column.name, mistakes)

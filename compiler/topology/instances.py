@@ -44,9 +44,9 @@ SettableNames = Mapping[str, tuple[Settable, list[str]]]
 class PartInstance:
     """An instance of a component at every peer of `groups`; inner parts are separate instances.
 
-    `values` holds a value for every number the component declares, `options` and `references` a word for
-    every option and every clock or link it names, `starts` the start values given here; `connections` join
-    a connector of this part to (part, connector), the part "ground" being fixed.
+    `values` has a value for every number the component declares, `options` and `references` a word for every
+    option and every clock or link, `starts` the start values given in the entry. `connections` connect a
+    connector of this part to (part, connector); the part "ground" is fixed.
     """
 
     name: str
@@ -64,16 +64,16 @@ class PartInstance:
 
     @property
     def all_starts(self) -> Named[ScalarValue]:
-        """The start values of all its variables that have one: those given here, else the component's own."""
-        local = {
+        """The start values of all variables that have one: from the entry, else from the component."""
+        of_component = {
             variable.name: ScalarValue(variable.start, variable.unit.dimension, None, self.location)
             for variable in self.component.variables
             if variable.start is not None
         }
-        return tuple((local | dict(self.starts)).items())
+        return tuple((of_component | dict(self.starts)).items())
 
     def reference(self, role: str) -> str | None:
-        """Return the clock or link this part names, when it names exactly one."""
+        """Return the clock or link that the part refers to in `role`; None if there is not exactly one."""
         names = {p.name for p in self.component.parameters if isinstance(p, Reference) and p.role == role}
         named = [word for name, word in self.references if name in names]
         return named[0] if len(named) == 1 else None
@@ -81,21 +81,24 @@ class PartInstance:
 
 @dataclass(frozen=True, slots=True)
 class PartReader:
-    """Reads the entries of parts, one after the other, into `parts`, each before those inside it."""
+    """Reads the entries of parts into `parts`; an outer part comes before the parts inside it.
+
+    `scope` has the names that entries can refer to, `numbers` the named numbers of the topology.
+    """
 
     scope: EntryScope
     numbers: NamedNumbers
     parts: list[PartInstance] = field(default_factory=list)
 
     def read(self, entry: PartEntry, redeclared: Mapping[str, PartEntry]) -> None:
-        """Read a part's entry, once for each element of an array, and write out the parts inside.
+        """Read a part's entry, with array elements and inner parts, and add the instances to `parts`.
 
         Parameters
         ----------
         entry
             The entry.
         redeclared
-            By group, the entry that the part has there instead, of another type.
+            The part's entry with another component type, by the name of the group that sets the type.
         """
         groups = tuple(self.numbers.counts)
         with self.numbers.mistakes:
@@ -103,13 +106,16 @@ class PartReader:
         others = {group: redeclared[group] for group in groups if redeclared.get(group, entry) is not entry}
         for group, other in others.items():
             self._read(other, (group,))
-        # Other meanings of a name come last: a table of names keeps the last.
-        rest = tuple(group for group in groups if group not in others)
-        if rest or not others:
-            self._read(entry, rest)
+        # The part of the ordinary type comes last: a table of names stores the last entry of a name.
+        remaining = tuple(group for group in groups if group not in others)
+        if remaining or not others:
+            self._read(entry, remaining)
 
     def _read(self, entry: PartEntry, groups: tuple[str, ...]) -> None:
-        """Read an entry as it applies to some groups."""
+        """Read an entry of the topology as a part of some groups of peers, and add its instances to `parts`.
+
+        `groups` are the names of the groups. Errors are added to the collector.
+        """
         name, component = entry.name, entry.component
         counts, mistakes = self.numbers.counts, self.numbers.mistakes
         shared = False
@@ -117,37 +123,48 @@ class PartReader:
             shared = _shared(entry)
         roles = [p.name for p in component.parameters if isinstance(p, Reference) and p.role in LINK_ROLES]
         if roles and entry.section != "links":
-            message = f"{name} is a {component.name}, whose {roles[0]} only a link has"
-            mistakes.add("E210", entry.location, message, hint=f"links: {{{name}: …}}")
-        peers, due = sum(counts[group] for group in groups), component.peers
-        shown = f"{name} ({component.name})"
+            message = f"{name} ({component.name}) is valid only in links, not in {entry.section}"
+            mistakes.add("E210", entry.location, message, advice=f"move {name} to links")
+        if entry.section == "links" and not _has_clock_and_delay(component):
+            message = f"{name} is a {component.name}, not a link: it has no clock or delay"
+            mistakes.add("E210", entry.location, message, fix="type: Link")
+            self.scope.parts.faulty.add(name)
+            return
+        peers, peer_limit = sum(counts[group] for group in groups), component.peers
+        subject = f"{name} ({component.name})"
         if component.receives_from_others and peers == 1:
-            message = f"{shown} follows the other peers and"
-            hint = f"at: [{', '.join(counts)}]" if len(counts) > 1 else f"{next(iter(counts))}: {{count: 2}}"
-            mistakes.add("E208", entry.location, message, expected="at least 2 peers", got="1", hint=hint)
-        if due and peers > due:
-            hint = f"count: {due}, or groups that make {due}: at: [left, right]"
-            mistakes.add("E208", entry.location, shown, expected=f"{due} peers", got=f"{peers:,}", hint=hint)
+            message = f"{subject} receives from the other peers"
+            fix = f"at: [{', '.join(counts)}]" if len(counts) > 1 else f"{next(iter(counts))}: {{count: 2}}"
+            mistakes.add("E208", entry.location, message, expected="at least 2 peers", got="1", fix=fix)
+        if peer_limit and peers > peer_limit:
+            expected, got = f"{peer_limit} peers", f"{peers:,}"
+            advice = f"set count: {peer_limit}, or use at: with groups that have {peer_limit} peers together"
+            mistakes.add("E208", entry.location, subject, expected=expected, got=got, advice=advice)
         for index, element in enumerate(entries(name, entry.count or 0), 1):
             read = read_entry(entry, self.scope, mistakes, index)
-            values, starts = (self._settled(pairs, component) for pairs in (read.values, read.starts))
+            values, starts = (self._evaluated(pairs, component) for pairs in (read.values, read.starts))
             tables = self._tables(entry, dict(read.described))
-            text = values, read.options, read.references, tables, starts, read.connections
-            self._add(PartInstance(element, entry.section, component, *text, shared, groups, entry.location))
+            bindings = values, read.options, read.references, tables, starts, read.connections
+            self._add(
+                PartInstance(element, entry.section, component, *bindings, shared, groups, entry.location)
+            )
 
     def _add(self, part: PartInstance) -> None:
-        """Add a part and those inside it."""
+        """Add a part and its inner parts to `parts`, at most `MOST_PARTS`."""
         self.parts.append(part)
         if len(self.parts) <= MOST_PARTS:
             for inner in part.component.inner:
-                self._add(_inside(part, inner, self.numbers.peers, self.numbers.mistakes))
+                self._add(_inner_instance(part, inner, self.numbers.peers, self.numbers.mistakes))
         elif len(self.parts) == MOST_PARTS + 1:
-            message = f"a peer would have more than {MOST_PARTS} parts, those inside parts included"
-            hint = "fewer or smaller arrays and components"
-            self.numbers.mistakes.add("E216", part.location, message, hint=hint)
+            message = f"expected at most {MOST_PARTS} parts at a peer, inner parts included"
+            advice = "use fewer or smaller arrays and components"
+            self.numbers.mistakes.add("E216", part.location, message, advice=advice)
 
-    def _settled(self, bindings: Named[ValueBinding], component: Component) -> Named[ScalarValue]:
-        """Return the values of named bindings, within the bounds of a component's parameters."""
+    def _evaluated(self, bindings: Named[ValueBinding], component: Component) -> Named[ScalarValue]:
+        """Return the values of named bindings.
+
+        Values out of the bounds of the component's parameters are recorded.
+        """
         pairs = []
         for name, binding in bindings:
             with self.numbers.mistakes:
@@ -157,74 +174,91 @@ class PartReader:
         return tuple(pairs)
 
     def _tables(self, entry: PartEntry, nodes: Mapping[str, Node]) -> tuple[TimeTable, ...]:
-        """Read the files of a part's quantities over time."""
+        """Return the time series of a part, read from the files that its entry names.
+
+        `nodes` has the YAML nodes of the file names, by parameter.
+        """
         time_tables = []
         for parameter in entry.component.parameters:
             if isinstance(parameter, Reference) and parameter.role == "table":
                 name, unit = parameter.name, parameter.unit
                 assert unit is not None
                 with self.numbers.mistakes:
-                    hint = f"{name}: force.csv"
+                    fix = f"{name}: force.csv"
                     if (node := nodes.get(name)) is None:
-                        raise fault("E201", entry.location, f"{entry.name} has no {name}", hint=hint)
+                        advice = f"use a .csv file with the columns time [s] and {name} [{unit.text}]"
+                        message = f"{entry.name} has no {name}"
+                        raise fault("E201", entry.location, message, fix=fix, advice=advice)
                     reader = partial(read_time_table, name=name, unit=unit, named_at=node.location)
-                    time_tables.append(self.numbers.files.read(text_of(node, name, hint), reader))
+                    time_tables.append(self.numbers.files.read(text_of(node, name, fix), reader))
         return tuple(filter(None, time_tables))
 
     def _groups_of(self, entry: PartEntry) -> tuple[str, ...]:
-        """Return the groups whose peers have a part."""
+        """Return the groups of peers that have a part: the list `at` of its entry, or all groups."""
         node, name, counts = entry.body.get("at"), entry.name, self.numbers.counts
         if node is None:
             return tuple(counts)
         items, groups = node.items if isinstance(node, Sequence) else (node,), ", ".join(counts)
         if entry.section == "links":
             parts = self.scope.parts.entries.values()
-            user = next((part.name for part in parts if name in part.words), "coordination")
-            message = f"{name} is a link, which joins all peers: who takes part is said by what uses it"
-            hint = f"{user}: {{at: [{', '.join(map(form, items)) or groups}]}}"
-            raise fault("E211", node.location, message, hint=hint)
+            user = next((part.name for part in parts if name in part.words), f"a coupler over {name}")
+            message = f"at has no effect on the link {name}"
+            advice = f"set at: [{', '.join(map(form, items)) or groups}] in {user}"
+            raise fault("E211", node.location, message, advice=advice)
         if not (isinstance(node, Sequence) and items):
             got = "an empty one" if isinstance(node, Sequence) else form(node)
             raise fault("E203", node.location, "at", "a list of groups", got, f"at: [{groups}]")
         texts = []
         for item in items:
             with self.numbers.mistakes:
-                message = f"{name} is at {{}}, which is no group of peers"
-                texts.append(among(text_of(item, "a group"), counts, item.location, message))
+                message = f"at of {name}: unknown group of peers {{}}"
+                texts.append(among(text_of(item, "group"), counts, item.location, message))
         return tuple(texts)
 
 
+def _has_clock_and_delay(component: Component) -> bool:
+    """Return whether a component has a clock and a delay, as every link has."""
+    roles = {parameter.role for parameter in component.parameters if isinstance(parameter, Reference)}
+    return "clock" in roles and component.parameter("delay") is not None
+
+
 def _shared(entry: PartEntry) -> bool:
-    """Return whether a part is declared a copy of one object, which its component allows."""
+    """Return whether an entry declares `shared: true`.
+
+    Raises ApcError if its component has no divided parameter.
+    """
     if (node := entry.body.get("shared")) is None:
         return False
     if not (isinstance(node, Scalar) and node.plain and isinstance(node.value, bool)):
         raise fault("E203", node.location, "shared", "true or false", form(node), "shared: true")
     if node.value and not any(parameter.divided for parameter in entry.component.numbers):
-        message = f"{entry.name} can't be shared: nothing of a {entry.component.name} is divided"
-        raise fault("E210", node.location, message)
+        message = f"shared has no effect on {entry.name} ({entry.component.name}): none of its parameters"
+        raise fault("E210", node.location, f"{message} is divided among the peers", advice="remove shared")
     return node.value
 
 
-def _inside(part: PartInstance, inner: Inner, peers: int, mistakes: Mistakes) -> PartInstance:
-    """Return a part inside a part; its numbers are expressions over the outer one's, in whole names.
+def _inner_instance(part: PartInstance, inner: Inner, peers: int, mistakes: Mistakes) -> PartInstance:
+    """Return the instance of a part inside `part`.
 
-    `mistakes` takes those of numbers without a value.
+    Its numbers are expressions over the outer part's numbers, by qualified name. `peers` is the number of all
+    peers; `mistakes` collects the errors of numbers.
     """
     entry, references = inner.entry, dict(part.references)
     tables = {table.name: table for table in part.tables}
     numbers: dict[tuple[str, ...], Fraction] = {(name,): value.number for name, value in part.values}
     numbers[PEERS] = Fraction(peers)
 
-    def whole(parts: tuple[str, ...]) -> tuple[str, ...]:
+    def qualified(parts: tuple[str, ...]) -> tuple[str, ...]:
+        """Return a name in the outer part with the name of that part in front; `peers` remains."""
         return parts if parts == PEERS else (*part.name.split("."), *parts)
 
-    def settled(bindings: Named[ValueBinding]) -> Named[ScalarValue]:
+    def evaluated(bindings: Named[ValueBinding]) -> Named[ScalarValue]:
+        """Return the values of bindings; a number of the outer part without a value is omitted."""
         pairs = []
         for name, binding in bindings:
-            with mistakes, suppress(KeyError):  # what the outer part has no value for was reported there
+            with mistakes, suppress(KeyError):  # a missing value of the outer part was already reported
                 value = settle(binding, numbers.__getitem__)
-                tree = value.expression and renamed(value.expression, whole)
+                tree = value.expression and renamed(value.expression, qualified)
                 pairs.append((name, replace(value, location=part.location, expression=tree)))
         return tuple(pairs)
 
@@ -232,38 +266,41 @@ def _inside(part: PartInstance, inner: Inner, peers: int, mistakes: Mistakes) ->
         part,
         name=f"{part.name}.{inner.name}",
         component=inner.component,
-        values=settled(entry.values),
+        values=evaluated(entry.values),
         options=entry.options,
         references=tuple(
-            (local, references.get(outer, "?")) for local, outer in entry.references if outer not in tables
+            (name, references.get(outer, "?")) for name, outer in entry.references if outer not in tables
         ),
         tables=tuple(
-            replace(tables[outer], name=local) for local, outer in entry.references if outer in tables
+            replace(tables[outer], name=name) for name, outer in entry.references if outer in tables
         ),
-        starts=settled(entry.starts),
+        starts=evaluated(entry.starts),
         connections=tuple(
-            (local, GROUND if other == GROUND else f"{part.name}.{other}", connector_of_other)
-            for local, other, connector_of_other in entry.connections
-            if other
+            (connector, GROUND if neighbor == GROUND else f"{part.name}.{neighbor}", neighbor_connector)
+            for connector, neighbor, neighbor_connector in entry.connections
+            if neighbor
         ),
     )
 
 
 def settable_names(parts: Iterable[PartInstance]) -> dict[str, tuple[Settable, list[str]]]:
-    """Return the settable names of a group: for each written name its type and its qualified names.
+    """Return the settable names of a group: the declaration and the qualified names of each written name.
 
-    The name of an array represents all its elements: `a[1].b[2]` is one of `a.b[2]`, `a[1].b` and `a.b`.
+    The name of an array represents all its elements: `a[1].b[2]` is an element of `a.b[2]`, `a[1].b` and
+    `a.b`.
     """
     result: dict[str, tuple[Settable, list[str]]] = {}
     for part in parts:
-        items: list[Settable] = [
-            p for p in part.component.parameters if not isinstance(p, Reference) or p.role == "clock"
+        declarations: list[Settable] = [
+            parameter
+            for parameter in part.component.parameters
+            if not isinstance(parameter, Reference) or parameter.role == "clock"
         ]
-        items += [v for v in part.component.variables if v.start is not None]
+        declarations += [variable for variable in part.component.variables if variable.start is not None]
         elements = product(
             *(dict.fromkeys((name, whole_and_index(name)[0])) for name in part.name.split("."))
         )
-        for name, item in product(map(".".join, elements), items):
-            _, wholes = result.setdefault(f"{name}.{item.name}", (item, []))
-            wholes.append(f"{part.name}.{item.name}")
+        for name, declaration in product(map(".".join, elements), declarations):
+            _, qualified = result.setdefault(f"{name}.{declaration.name}", (declaration, []))
+            qualified.append(f"{part.name}.{declaration.name}")
     return result

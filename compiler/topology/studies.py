@@ -2,8 +2,8 @@
 
 Takes: the sections `experiment` and `studies`. Gives: `read_experiment`, an `Experiment`; `read_studies`,
 `Axis`es and the settings of tuning.
-Guarantees: a duration is more than nothing, a range has its lower end first and the parameter's unit.
-Does not: do it.
+Guarantees: a duration is positive, a range has its lower end first and the parameter's unit.
+Does not: run a study.
 """
 
 from __future__ import annotations
@@ -35,15 +35,20 @@ TUNED = ("free", "maximize", "minimize", "subject", "over", "hands")
 
 
 def read_experiment(root: MappingReader, numbers: NamedNumbers) -> Experiment:
-    """Read `experiment: {duration: 3 s, seed: 1}`; `numbers` reads the duration, in seconds."""
+    """Return the experiment, from the section `experiment: {duration: 3 s, seed: 1}`.
+
+    `numbers` reads the duration.
+    """
 
     def duration(node: Node, subject: str) -> Fraction:
+        """Return the positive duration in seconds."""
         value = numbers.read_time(node, subject, "s")
         if value.number <= 0:
             raise fault("E207", value.location, subject, "more than 0 s", str(value))
         return value.number
 
     def seed(node: Node, subject: str) -> int:
+        """Return the seed of random numbers, an integer from 0 to 2^63 - 1."""
         number = whole_number(node)
         if number is None or not 0 <= number < 2**63:
             raise fault("E203", node.location, subject, "a whole number, 0 or more", form(node))
@@ -53,27 +58,35 @@ def read_experiment(root: MappingReader, numbers: NamedNumbers) -> Experiment:
     return Experiment(section.read("duration", duration, None), section.read("seed", seed, 0))
 
 
-def _section(around: MappingReader, key: str, keys: tuple[str, ...], hint: str) -> MappingReader:
-    """Return the contents of a section, which may be missing."""
-    node = around.read(key, lambda node, _: mapping_of(node, key, f"{key}: {hint}"), None)
-    return MappingReader(node or Mapping((), around.location), keys, key, around.mistakes)
+def _section(parent: MappingReader, key: str, keys: tuple[str, ...], fix: str) -> MappingReader:
+    """Return a reader of a subsection; a missing subsection is read as an empty mapping.
+
+    Parameters
+    ----------
+    parent, key
+        The section that contains it, and its key.
+    keys, fix
+        The keys that it may have, and an example for messages.
+    """
+    node = parent.read(key, lambda node, _: mapping_of(node, key, f"{key}: {fix}"), None)
+    return MappingReader(node or Mapping((), parent.location), keys, key, parent.mistakes)
 
 
 def read_studies(
     root: MappingReader, settable: SettableNames, numbers: NamedNumbers, is_reported: Callable[[str], bool]
 ) -> tuple[tuple[Axis, ...], tuple[tuple[str, str], ...]]:
-    """Read `studies: {region: {x: {contact.stiffness: [0 N/m, 5000 N/m]}, y: …}, tune: {free: …}}`.
+    """Return the axes and the tuning study, from `studies: {region: {x: …, y: …}, tune: {free: …}}`.
 
     Parameters
     ----------
     root
         The topology.
     settable
-        The settable names, as written.
+        The settable names, with their declarations.
     numbers
-        Reads a value of a parameter.
+        The named numbers that the ends of a range may depend on.
     is_reported
-        Whether a name's part was reported as faulty, so that its absence needs no message.
+        Whether an error of the part of a name was reported, so that an unknown name needs no second message.
 
     Returns
     -------
@@ -83,44 +96,52 @@ def read_studies(
         The tuning study, as in `compiled.Model.tune`.
     """
 
-    def values(key: str, name: Scalar, span: Node, hint: str) -> tuple[ScalarValue, ScalarValue]:
+    def values(key: str, name: Scalar, span: Node, fix: str) -> tuple[ScalarValue, ScalarValue]:
+        """Return the lower and the upper end of the range of the parameter `name`.
+
+        `key` and `fix` are for messages.
+        """
         if not (isinstance(span, Sequence) and len(span.items) == 2):
-            raise fault("E203", span.location, name.text, "a list of two values", form(span), hint)
-        known = {known: item for known, (item, _) in settable.items() if isinstance(item, NumberParameter)}
+            raise fault("E203", span.location, name.text, "a list of two values", form(span), fix)
+        known = {word: item for word, (item, _) in settable.items() if isinstance(item, NumberParameter)}
         if name.text not in known:
             if is_reported(name.text):
                 raise AlreadyReportedError
-            message = f"{key} names {brief(name.text)}, which is no parameter of a part"
+            message = f"{key}: {brief(name.text)} is not a parameter of a part"
             raise unknown("E206", name.location, message, name.text, known)
         low, high = (numbers.read_for(item, name.text, known[name.text]) for item in span.items)
         if low.number >= high.number:
-            message = f"the range of {name.text}"
-            raise fault("E207", span.location, message, "its lower end first", f"{low} to {high}")
+            message = f"range of {name.text}"
+            fix = f"{name.text}: [{high}, {low}]" if low.number > high.number else ""
+            raise fault("E207", span.location, message, "the lower end first", f"{low} to {high}", fix)
         return low, high
 
     def axis(node: Node, key: str) -> Axis:
-        hint = f"{key}: {{contact.stiffness: [0 N/m, 5000 N/m]}}"
-        body = mapping_of(node, key, hint)
+        """Return the axis of the region from a mapping with one parameter and its range, in SI units."""
+        fix = f"{key}: {{contact.stiffness: [0 N/m, 5000 N/m]}}"
+        body = mapping_of(node, key, fix)
         if len(body.entries) != 1:
-            raise fault("E203", body.location, key, "one parameter and its range", hint=hint)
+            raise fault("E203", body.location, key, "one parameter and its range", fix=fix)
         name, span = body.entries[0]
-        low, high = values(key, name, span, hint)
+        low, high = values(key, name, span, fix)
         return Axis(name.text, low.number, high.number)
 
     def free(name: Scalar, span: Node) -> tuple[str, str]:
+        """Return the setting `free` of one tuned parameter, as text `NAME=LOW UNIT:HIGH UNIT`."""
         low, high = values("free", name, span, f"free: {{{name.text}: [10 N/m, 5000 N/m]}}")
         unit = format_dimension(low.dimension)
         return "free", f"{name.text}={float(low.number)!r} {unit}:{float(high.number)!r} {unit}"
 
     def listed(key: str) -> Callable[[Scalar, Node], tuple[str, str]]:
+        """Return a function that returns a setting `key` of the tuning study as text `NAME=VALUE`."""
         return lambda name, node: (key, f"{name.text}={text_of(node, name.text)}")
 
     studies = _section(root, "studies", ("region", "tune"), "{region: {x: …, y: …}}")
     region = _section(studies, "region", AXES, "{x: …, y: …}")
     axes = (region.read(key, axis, None) for key in AXES)
     tune = _section(studies, "tune", TUNED, "{free: …, maximize: …}")
-    requested = tune.each("free", "{coordination.stiffness: [10 N/m, 5000 N/m]}", free)
-    for key, hint in (("subject", "{decay: 60 dB in 2 s}"), ("over", "{user.count: 2:10}")):
-        requested += tune.each(key, hint, listed(key))
-    requested += [(key, tune.text(key)) for key in ("maximize", "minimize", "hands") if key in tune.nodes]
-    return tuple(axis for axis in axes if axis is not None), tuple(requested)
+    settings = tune.each("free", "{coordination.stiffness: [10 N/m, 5000 N/m]}", free)
+    for key, fix in (("subject", "{decay: 60 dB in 2 s}"), ("over", "{user.count: 2:10}")):
+        settings += tune.each(key, fix, listed(key))
+    settings += [(key, tune.text(key)) for key in ("maximize", "minimize", "hands") if key in tune.nodes]
+    return tuple(axis for axis in axes if axis is not None), tuple(settings)

@@ -1,18 +1,20 @@
 """The clocks of a topology: their periods and phases.
 
 Takes: the section `clocks`. Gives: `ClockDeclaration`, `read_clocks`.
-Guarantees: a period is more than nothing, a phase less than its period; both are exact.
-Does not: know what ticks with a clock (see `clocks`).
+Guarantees: a period is positive, a phase is less than its period; both are exact.
+Does not: assign variables to clocks (see `equations.clocks`).
 """
 
 from __future__ import annotations
 
 import contextlib
 from collections.abc import Container
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
+from functools import partial
 
 from apc.compiler.components.component import RESERVED
+from apc.compiler.errors import ApcError
 from apc.compiler.language.dimensions import SECOND
 from apc.compiler.language.values import AlreadyReportedError, ScalarValue
 from apc.compiler.number_parsing import plain_float
@@ -21,12 +23,12 @@ from apc.compiler.source.reading import MappingReader, brief, fault, name_of
 from apc.compiler.topology.topology_parameters import NamedNumbers
 
 CLOCK = ("period", "phase")
-LIKE_A_RATE = 30  # a larger number without a unit is rather a rate in Hz than a period in ms
+LIKE_A_RATE = 30  # a larger number without a unit is probably a rate in Hz, a smaller one a period in ms
 
 
 @dataclass(frozen=True, slots=True)
 class ClockDeclaration:
-    """Ticks at `phase + k*period`, in seconds."""
+    """A clock with ticks at `phase + k*period` for k = 0, 1, 2, …; both times in seconds."""
 
     name: str
     period: ScalarValue
@@ -36,16 +38,18 @@ class ClockDeclaration:
 def read_clocks(
     root: MappingReader, numbers: NamedNumbers, used: Container[str]
 ) -> dict[str, ClockDeclaration]:
-    """Read `clocks: {haptic: 1 ms, network: {period: 8 ms, phase: 2 ms}}`.
+    """Return the clocks of a topology by name.
+
+    The section is `clocks: {haptic: 1 ms, network: {period: 8 ms, phase: 2 ms}}`.
 
     Parameters
     ----------
     root
         The topology.
     numbers
-        Reads the times.
+        The named numbers that the times may depend on.
     used
-        The names that are used already.
+        The names already used in the topology, which a clock may not have.
     """
     result: dict[str, ClockDeclaration] = {}
     for key, value in root.section("clocks", "{haptic: 1 ms}"):
@@ -56,32 +60,48 @@ def read_clocks(
 
 
 def _read_clock(name: str, node: Node, numbers: NamedNumbers, root: MappingReader) -> ClockDeclaration:
-    """Read a period, or a mapping of a period and a phase."""
+    """Return the clock of one entry: a period or a rate, or a mapping with the keys period and phase.
+
+    `numbers` reads times; `root` has the collector of errors. Raises ApcError for an invalid period or phase.
+    """
     phase = ScalarValue(Fraction(0), SECOND, None, node.location)
     if isinstance(node, Mapping):
         body = MappingReader(node, CLOCK, f"clock {name}", root.mistakes)
         if "period" not in body.nodes:
-            raise fault("E201", node.location, f"clock {name} has no period", hint="period: 1 ms")
-        given = body.read("period", numbers.read_time, None)
-        shift = body.read("phase", numbers.read_time, None if "phase" in body.nodes else phase)
-        if given is None or shift is None:
+            raise fault("E201", node.location, f"clock {name} has no period", fix="period: 1 ms")
+        given_period = body.read("period", partial(_period, numbers=numbers), None)
+        given_phase = body.read("phase", numbers.read_time, None if "phase" in body.nodes else phase)
+        if given_period is None or given_phase is None:
             raise AlreadyReportedError
-        period, phase = given, shift
+        period, phase = given_period, given_phase
     elif isinstance(node, Scalar) and type(node.value) in (int, float) and node.plain:
-        hint = f"{name}: 1 ms"
+        fix = f"{name}: 1 ms"
         with contextlib.suppress(ValueError):  # YAML's other number formats are not valid for a rate
             if (size := plain_float(node.text)) > 0:
                 rates = f"{name}: {node.text} Hz", f"{name}: {node.text} ms"
-                hint = ", or ".join(rates if size > LIKE_A_RATE else reversed(rates))
-        raise fault("E204", node.location, name, "a time or a rate", f"{brief(node.text)} (no unit)", hint)
+                fix = ", or ".join(rates if size > LIKE_A_RATE else reversed(rates))
+        raise fault("E204", node.location, name, "a time or a rate", f"{brief(node.text)} (no unit)", fix)
     else:
-        period = numbers.read_time(node, name)
+        period = _period(node, name, numbers)
     if period.number <= 0:
-        message, hint = f"the period of clock {name}", f"{name}: 1 ms"
-        raise fault("E207", period.location, message, "more than 0 s", str(period), hint)
+        message, fix = f"period of clock {name}", f"{name}: 1 ms"
+        raise fault("E207", period.location, message, "more than 0 s", str(period), fix)
     if not 0 <= phase.number < period.number:
-        expected = "0 s or more and less than its period"
-        rest = f"{1000 * float(phase.number % period.number):.6g}"
-        hint = f"phase: {rest} ms" if float(rest) < 1000 * float(period.number) else ""
-        raise fault("E207", phase.location, f"the phase of clock {name}", expected, str(phase), hint)
+        expected = "at least 0 s and less than the period"
+        phase_ms = f"{1000 * float(phase.number % period.number):.6g}"
+        fix = f"phase: {phase_ms} ms" if float(phase_ms) < 1000 * float(period.number) else ""
+        raise fault("E207", phase.location, f"phase of clock {name}", expected, str(phase), fix)
     return ClockDeclaration(name, period, phase)
+
+
+def _period(node: Node, subject: str, numbers: NamedNumbers) -> ScalarValue:
+    """Return the period of a clock in seconds, from a time or a rate. Raises ApcError for other values."""
+    try:
+        return numbers.read_time(node, subject)
+    except ApcError as error:
+        raise ApcError(
+            replace(mistake, expected="a time or a rate", fix=mistake.fix or f"{subject}: 1 ms")
+            if mistake.code == "E204" and mistake.expected == "ms"
+            else mistake
+            for mistake in error.mistakes
+        ) from None

@@ -3,10 +3,10 @@
 Takes: the YAML source of a topology and a library. Gives: `build_topology`, the `Topology`;
 `library_folders`, `readable_library`.
 Guarantees: parts, clocks, links, parameters and connections that are named exist; quantities have the unit
-their parameter wants and lie within its bounds; parts inside parts and arrays are written out; all mistakes
-of the file are reported together.
-Does not: look into a component's equations, or read a section itself: each has a module of its own
-(`groups`, `parameters`, `timebase`, `instances`, `links`, `studies`).
+their parameter requires and lie within its bounds; inner parts and array elements are separate parts; all
+mistakes of the file are reported together.
+Does not: analyze a component's equations, or read a section: each section has its own module
+(`groups`, `topology_parameters`, `timebase`, `instances`, `links`, `studies`).
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from apc.compiler.errors import Diagnostic, Mistakes, SourceLocation, visible
 from apc.compiler.files import RefusedError, files_below
 from apc.compiler.language.csv_tables import NamedFiles
 from apc.compiler.language.values import AlreadyReportedError, ScalarValue
-from apc.compiler.source.nodes import Mapping, Sequence
+from apc.compiler.source.nodes import Mapping, Scalar, Sequence
 from apc.compiler.source.reading import MappingReader, brief, fault, mapping_of, text_of
 from apc.compiler.source.source import Source
 from apc.compiler.topology.groups import GroupDeclaration, GroupReader, read_counts
@@ -37,7 +37,7 @@ from apc.compiler.topology.timebase import ClockDeclaration, read_clocks
 from apc.compiler.topology.topology_parameters import read_named_numbers
 from apc.compiler.topology.topology_warnings import topology_warnings
 
-SECTIONS = ("masses", "couplers", "links", "hands")  # those of parts
+SECTIONS = ("masses", "couplers", "links", "hands")  # the sections with parts
 # The sections of a topology, described in view/schema.yaml.
 TOPOLOGY = (
     "topology",
@@ -53,6 +53,8 @@ TOPOLOGY = (
     "experiment",
     "studies",
 )
+# The sections that can be nested in another one by their indentation.
+NESTED = (*SECTIONS, "clocks", "parameters", "peers", "experiment", "studies")
 # The required sections, and an example of each.
 REQUIRED = {
     "topology": "my-topology",
@@ -63,7 +65,7 @@ REQUIRED = {
 
 @dataclass(frozen=True, slots=True)
 class Topology:
-    """A topology, whole. `texts` are the files it names; `warnings` are no mistakes."""
+    """A topology with all its sections. `texts` are the names of the files that it refers to."""
 
     name: str
     description: str
@@ -86,7 +88,7 @@ class Topology:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The names of its groups and parts."""
+        """The names of the groups and parts."""
         return (*(group.name for group in self.groups), *(part.name for part in self.parts))
 
     def part(self, name: str) -> PartInstance:
@@ -95,7 +97,10 @@ class Topology:
 
 
 def library_folders(source: Source) -> tuple[Path, ...]:
-    """Return the folders of components that a topology names. Raises ApcError for one that isn't there."""
+    """Return the folders of components that a topology names in `library`.
+
+    Raises ApcError for a folder that cannot be read.
+    """
     node = source.root.get("library") if isinstance(source.root, Mapping) else None
     mistakes = Mistakes()
     paths = []
@@ -110,16 +115,16 @@ def library_folders(source: Source) -> tuple[Path, ...]:
 def readable_library(
     folder: Path, text: str, location: SourceLocation, *, key: str = "library:", example: str = "./parts"
 ) -> Path:
-    """Return a folder of components.
+    """Return the folder of components after checking that it can be read.
 
     Parameters
     ----------
     folder, text
         The folder, and its name as written.
     location
-        Where it is named.
+        The place of the name.
     key, example
-        The key or option that names it, and a value for it, for the fix.
+        The key or option that names the folder, and an example of its value, for the fix.
 
     Raises
     ------
@@ -130,40 +135,47 @@ def readable_library(
         files_below(folder, SUFFIX)
     except RefusedError as refused:
         message = f"the library folder {brief(text)} {refused.words}"
-        hint = f"{key} {example}" if refused.why == "large" else ""
+        fix = f"{key} {example}" if refused.why == "large" else ""
         if refused.why == "missing" and folder.is_file():
-            message = f"the library {brief(text)} is a file, and a library is a folder"
-            hint = f"{key} {text.rpartition('/')[0] or '.'}"
+            message = f"library: expected a folder, got the file {brief(text)}"
+            fix = f"{key} {text.rpartition('/')[0] or '.'}"
         elif refused.why == "missing" and folder != Path(text):
-            message += f": {folder} was looked for, as paths begin beside the topology"
-        raise fault("E214", location, message, hint=hint) from None
+            message += f" (paths are relative to the topology; searched: {folder})"
+        raise fault("E214", location, message, fix=fix) from None
     return folder
 
 
 def _folder_of(source: Source) -> Path:
+    """Return the folder that relative paths of a topology refer to."""
     return source.path.parent if source.path is not None else Path()
 
 
 def build_topology(source: Source, library: Library) -> Topology:
-    """Read a topology, those sections first that others refer to. Raises ApcError with all its mistakes."""
+    """Return the topology of a source. Raises ApcError with all mistakes of the source.
+
+    A section is read after the sections whose names it can refer to.
+    """
     mistakes = Mistakes()
     files = NamedFiles(_folder_of(source), mistakes)
-    node = mapping_of(source.root, "a topology", "topology: my-topology")
+    node = mapping_of(source.root, "topology", "topology: my-topology")
     peer_type, name = definition_of(source)
     if peer_type:
-        message = f"{name} is a {peer_type}; a topology has parts of its type, and names the folder it is in"
-        raise fault("E201", node.location, message, hint="library: ./parts")
+        message = (
+            f"{name} is a {peer_type}, not a topology; name its folder in a topology and use it as a type"
+        )
+        raise fault("E201", node.location, message, fix="library: ./parts")
+    _refuse_nested_section(node)
     root = MappingReader(node, TOPOLOGY, "a topology", mistakes)
     for key, example in REQUIRED.items():
         if key not in root.nodes:
             message = (
                 "the topology has no name" if key == "topology" else f"the topology has no {key} section"
             )
-            mistakes.add("E201", root.location, message, hint=f"{key}: {example}")
+            mistakes.add("E201", root.location, message, fix=f"{key}: {example}")
     bodies = read_counts(root, files)
-    named = [key.text for key, _ in root.section("peers", "{user: {count: 3}}")]
-    complete = len(bodies) == len(named)  # a group whose count is at fault is named all the same
-    counts = {name: bodies[name].count if name in bodies else 2 for name in (*bodies, *named)}
+    group_names = [key.text for key, _ in root.section("peers", "{user: {count: 3}}")]
+    complete = len(bodies) == len(group_names)  # a group with an invalid count is included by name
+    counts = {name: bodies[name].count if name in bodies else 2 for name in (*bodies, *group_names)}
     mistakes.names = tuple(counts)
     numbers = read_named_numbers(root, counts, files, complete=complete)
     clocks = read_clocks(root, numbers, {*numbers.values, *counts})
@@ -176,9 +188,9 @@ def build_topology(source: Source, library: Library) -> Topology:
         numbers.dimension, numbers.names, names.of_role, sections, "this topology", names.complete
     )
     reader = PartReader(scope, numbers)
-    others_at = redeclared(bodies.values(), sections)
+    redeclared_entries = redeclared(bodies.values(), sections)
     for entry in entries.values():
-        reader.read(without_range(entry), others_at.get(entry.name, {}))
+        reader.read(without_range(entry), redeclared_entries.get(entry.name, {}))
     parts = reader.parts
     links: list[LinkDeclaration] = []
     for part in parts:
@@ -186,10 +198,12 @@ def build_topology(source: Source, library: Library) -> Topology:
             with mistakes:
                 links.append(read_link(part, entries[part.name], numbers))
     others = tuple(part for part in parts if part.section != "links")
-    group_reader = GroupReader(settable_names(others), others, others_at, clocks, numbers, names.explain)
+    group_reader = GroupReader(
+        settable_names(others), others, redeclared_entries, clocks, numbers, names.explain
+    )
     groups = tuple(group_reader.read(group) for group in bodies.values())
     settable = settable_names(parts)
-    for link in links:  # what one loses by can vary where it follows from no other number
+    for link in links:  # a loss probability is settable unless it depends on other numbers
         for name, value in link.channel.loss if link.channel is not None else ():
             if value.expression is None:
                 settable[name] = PROBABILITY, [name]
@@ -210,13 +224,33 @@ def build_topology(source: Source, library: Library) -> Topology:
         tune,
         tuple(sorted(files.names)),
         root.location,
-        topology_warnings(parts, entries, groups, library.replaced),
+        topology_warnings(parts, links, entries, groups, library.replaced),
     )
+
+
+def _refuse_nested_section(root: Mapping) -> None:
+    """Raise ApcError E202 for a section within another one, such as `couplers` within `masses`.
+
+    A part can have the name of a section; then its values are no mappings.
+    """
+    for section in ("clocks", "parameters", "peers", *SECTIONS):
+        body = root.get(section)
+        for key, value in body.entries if isinstance(body, Mapping) else ():
+            is_empty = isinstance(value, Scalar) and value.value is None
+            items = value.entries if isinstance(value, Mapping) else ()
+            if key.text in NESTED and (
+                is_empty or (items and all(isinstance(item, Mapping) for _, item in items))
+            ):
+                message = f"{key.text} is a section, not an entry of {section}"
+                advice = f"write {key.text} at the indentation of {section}"
+                raise fault("E202", key.location, message, advice=advice)
 
 
 @dataclass(frozen=True, slots=True)
 class _Names:
-    """The meanings of the names in a topology, and whether the error of an undefined one was reported."""
+    """The names of a topology: clocks, parts and groups, and whether the error of a missing part was
+    reported.
+    """
 
     root: MappingReader
     sections: PartEntries
@@ -225,7 +259,7 @@ class _Names:
 
     @property
     def complete(self) -> bool:
-        """Whether no section of parts is missing that has to be there, or is none."""
+        """Whether the sections of parts are mappings and the required section `masses` exists."""
         nodes = self.root.nodes
         return "masses" in nodes and all(isinstance(nodes.get(key), Mapping | None) for key in SECTIONS)
 
@@ -235,29 +269,44 @@ class _Names:
         return [name for name, entry in self.sections.entries.items() if entry.section == "links"]
 
     def of_role(self, role: str, word: str) -> Collection[str]:
-        """Return the clocks or links, unused ones first. Raises the errors of their section."""
+        """Return the names of the clocks or links, unused ones first, for `role` "clock" or "link".
+
+        Raises ApcError if `word` is given and the section is missing, AlreadyReportedError if the entry of
+        `word` is invalid.
+        """
         section = f"{role}s"
         node = self.root.nodes.get(section)
         if word and node is None:
-            example = "clocks: {haptic: 1 ms}" if role == "clock" else "links: {lan: {clock: network}}"
-            raise fault("E201", self.root.location, f"the topology has no {section} section", hint=example)
+            nodes = (entry.body.get(role) for entry in self.sections.entries.values())
+            used = dict.fromkeys(node.text for node in nodes if isinstance(node, Scalar) and node.text)
+            value = "1 ms"
+            if role == "link":
+                value = f"{{clock: {next(iter(self.of_role('clock', '')), 'network')}}}"
+            example = f"{section}: {{{', '.join(f'{name}: {value}' for name in used or (word,))}}}"
+            raise fault("E201", self.root.location, f"the topology has no {section} section", fix=example)
         known = self.clocks if role == "clock" else self.links
         if word and word not in known and not (isinstance(node, Mapping) and node.get(word) is None):
             raise AlreadyReportedError
-        text = () if word else {word for entry in self.sections.entries.values() for word in entry.words}
+        text = () if word else {used for entry in self.sections.entries.values() for used in entry.words}
         return sorted(known, key=lambda name: name in text)
 
     def is_reported(self, name: str) -> bool:
-        """Return whether `part.parameter` is of a part that is missing for a fault that was reported."""
+        """Return whether the part of the name `part.parameter` is missing due to an error that was
+        reported.
+        """
         part = re.split(r"[.\[]", name)[0]
         return part in self.sections.faulty or (not self.complete and part not in self.sections.entries)
 
     def explain(self, name: str, location: SourceLocation) -> None:
-        """Raise why a group can't set `part.parameter`, if that is known or was reported."""
+        """Raise the specific error of a name `part.parameter` that a group can't set, if there is one.
+
+        Raises ApcError for a parameter of a link, AlreadyReportedError for a part whose error was reported.
+        """
         link, _, parameter = name.partition(".")
         if link in self.links:
             example = f"{link}: {{delays: {{{self.groups[0]}: {{{self.groups[-1]}: 12 ms}}}}}}"
-            message = f"{name} is of a link, the same for all peers: a group can't set it"
-            raise fault("E211", location, message, hint=example if parameter == "delay" else "")
+            message = f"{name} belongs to a link and can't be set by a group"
+            advice = f"set the delay between two groups in links, as in {example}"
+            raise fault("E211", location, message, advice=advice if parameter == "delay" else "")
         if self.is_reported(name):
             raise AlreadyReportedError

@@ -1,10 +1,10 @@
 """The named numbers of a topology, and reading numbers that may be expressions over them.
 
 Takes: the section `parameters`, the groups' counts and the topology's files.
-Gives: `NamedNumbers`, which all sections read by, `read_named_numbers`, `read_count_by_names`.
-Guarantees: a number read has the dimension it must have; what depends on a name whose fault was reported adds
-no message of its own.
-Does not: know what a number is for, but for the bounds of a component's parameter.
+Gives: `NamedNumbers`, by which all sections read numbers, `read_named_numbers`, `read_count_by_names`.
+Guarantees: a number read has the required dimension; an expression over a name whose error was reported adds
+no second message.
+Does not: check a value, except against the bounds of a component's parameter.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _WORD = re.compile(r"[A-Za-z]\w*", re.ASCII)
 def read_named_numbers(
     root: MappingReader, counts: Mapping[str, int], files: NamedFiles, *, complete: bool = True
 ) -> NamedNumbers:
-    """Read `parameters: {kt: 2000 N/m}`.
+    """Read the section `parameters: {kt: 2000 N/m}`; return the named numbers with their values in SI units.
 
     Parameters
     ----------
@@ -48,52 +48,52 @@ def read_named_numbers(
     counts
         The number of peers of each group; the name `peers` is their sum.
     files
-        Reads the topology's files, and collects errors.
+        The reader of the topology's files, which also collects the errors.
     complete
-        Whether every group's count is known; otherwise values that depend on `peers` add no message.
+        Whether the count of every group is valid; otherwise values that depend on `peers` add no message.
     """
-    waiting: dict[str, ValueBinding] = {}
+    bindings: dict[str, ValueBinding] = {}
     section = root.section("parameters", "{kt: 2000 N/m}")
-    others = {key.text for key, _ in section} | {"peers"}
+    known = {key.text for key, _ in section} | {"peers"}
     for key, value in section:
         with files.mistakes:
             name = name_of(key, "a parameter", words=RESERVED)
-            waiting[name] = read_free(value, name, others)
-    values = resolve_in_order(waiting, sum(counts.values()) if complete else None, files.mistakes)
+            bindings[name] = read_free(value, name, known)
+    values = resolve_in_order(bindings, sum(counts.values()) if complete else None, files.mistakes)
     faulty = {key.text for key, _ in section} - values.keys() | (set() if complete else {"peers"})
     return NamedNumbers(values, faulty, counts, files)
 
 
 def read_count_by_names(node: Scalar, root: MappingReader) -> ScalarValue:
-    """Read how many peers a group has from named numbers, before it is known how many there are in all.
+    """Return the number of peers of a group, an expression over named numbers that do not depend on `peers`.
 
     Parameters
     ----------
     node
-        The count, an expression.
+        The expression.
     root
-        The topology, whose own mistakes are recorded when it is read for good.
+        The topology. Errors of its section `parameters` are not recorded: the section is read again later.
 
     Raises
     ------
     ApcError
-        E208 what the count names that isn't there, or what follows from the number of peers.
+        E208 the expression names an unknown number, or depends on the number of all peers.
     """
     numbers = read_named_numbers(root, {"": 1}, NamedFiles(Path(), Mistakes()))
     known = {*numbers.names, *numbers.faulty}
     if unknown := [word for word in _WORD.findall(node.text) if word not in known]:
-        expected = "a whole number, or an expression over numbers of parameters"
+        expected = "a whole number, or an expression in dimensionless parameters"
         raise fault("E208", node.location, "count", expected, brief(unknown[0]), "count: 3")
     count = numbers.read(node, "count", DIMENSIONLESS, "1")
-    used, waiting = set[tuple[str, ...]](), [count]
-    while waiting:
-        if (tree := waiting.pop().expression) is not None:
+    used, unvisited = set[tuple[str, ...]](), [count]
+    while unvisited:
+        if (tree := unvisited.pop().expression) is not None:
             new = {name.parts for name in names(tree)} - used
             if PEERS in new:
-                message = f"{brief(node.text)} depends on peers, which it is a part of"
-                raise fault("E208", node.location, message, hint="count: 3")
+                message = f"count {brief(node.text)} depends on peers, the sum of all counts"
+                raise fault("E208", node.location, message, fix="count: 3")
             used |= new
-            waiting += (numbers.values[".".join(parts)] for parts in new)
+            unvisited += (numbers.values[".".join(parts)] for parts in new)
     return count
 
 
@@ -101,8 +101,8 @@ def read_count_by_names(node: Scalar, root: MappingReader) -> ScalarValue:
 class NamedNumbers:
     """The names available in expressions of the topology: `values`, and the number of peers.
 
-    `faulty` are names without a value, each of which was reported; `counts` the groups and how many peers
-    each has; `files` reads files that are named, and takes mistakes.
+    `faulty` are the names whose error was reported, so that they have no value; `counts` has the number of
+    peers of each group; `files` reads files and collects mistakes.
     """
 
     values: Mapping[str, ScalarValue]
@@ -126,7 +126,10 @@ class NamedNumbers:
         return ("peers", *self.values)
 
     def dimension(self, parts: tuple[str, ...]) -> Dimension | None:
-        """Return the dimension of a name, None of none there is. Raises AlreadyReportedError."""
+        """Return the dimension of a name, or None if the name is unknown.
+
+        Raises AlreadyReportedError for a name whose error was reported.
+        """
         name = ".".join(parts)
         if name in self.faulty:
             raise AlreadyReportedError
@@ -134,7 +137,7 @@ class NamedNumbers:
         return DIMENSIONLESS if parts == PEERS else None if value is None else value.dimension
 
     def number(self, parts: tuple[str, ...]) -> Fraction:
-        """Return the value of a name, in SI."""
+        """Return the value of a name, in SI units."""
         return Fraction(self.peers) if parts == PEERS else self.values[".".join(parts)].number
 
     def read(
@@ -145,30 +148,35 @@ class NamedNumbers:
         unit: str,
         words: Collection[tuple[str, Fraction]] = (),
     ) -> ScalarValue:
-        """Read a number.
+        """Return the number of a node, a quantity or an expression, with its dimension checked.
 
         Parameters
         ----------
         node
             The YAML node.
         subject
-            Its name, for messages.
+            The name of the number, for messages.
         dimension, unit
-            The required dimension and unit.
+            The required dimension, and a unit for messages.
         words
-            Words that represent numbers.
+            Words that represent numbers, with their values.
 
         Raises
         ------
         ApcError
-            An invalid number.
+            The number is invalid.
         """
         binding = read_binding(node, subject, dimension, unit, self.dimension, self.names, words)
         return settle(binding, self.number)
 
     def read_time(self, node: Node, subject: str, unit: str = "ms") -> ScalarValue:
-        """Read a time, mostly in `unit`; a rate in Hz counts as its reciprocal. Raises ApcError."""
-        if not (isinstance(node, Scalar) and node.text.rstrip().endswith("Hz")):
+        """Return the time of a node, in seconds; a rate in Hz is read as its reciprocal.
+
+        `unit` is the unit proposed in messages. Raises ApcError for an invalid time or a rate that is not
+        positive.
+        """
+        # In any case of the letters, so that the error of an incorrect one proposes a rate.
+        if not (isinstance(node, Scalar) and re.search(r"(hz|hertz)\s*$", node.text, re.IGNORECASE)):
             return self.read(node, subject, SECOND, unit)
         rate = self.read(node, subject, SECOND.power(-1), "Hz")
         if rate.number <= 0:
@@ -176,19 +184,19 @@ class NamedNumbers:
         return ScalarValue(1 / rate.number, SECOND, None, rate.location)
 
     def read_for(self, node: Node, subject: str, item: Settable) -> ScalarValue:
-        """Read a number for a parameter, within its bounds, or a start value for a variable.
+        """Return the number of a node for a declared parameter, or the start value of a declared variable.
 
         Parameters
         ----------
         node, subject
-            The YAML node, and its name for messages.
+            The YAML node, and the name of the number for messages.
         item
             The declaration: unit, bounds, and words that represent numbers.
 
         Raises
         ------
         ApcError
-            An invalid number; a number out of bounds is recorded.
+            The number is invalid; a number out of bounds is recorded and returned.
         """
         assert isinstance(item, NumberParameter | ComponentVariable)
         words = item.words if isinstance(item, NumberParameter) else ()

@@ -4,7 +4,7 @@ Takes: a `LoadedLibrary`, a name.
 Gives: `library_lines` and `library_document`; `component_text` and `component_document` of a component or
 connector; `topologies`, `topology_lines`, `topology_named`, `tables_of` of the topologies that come with the
 program.
-Guarantees: a component is shown with inherited items; its definition is shown as written.
+Guarantees: the details of a component have its inherited items, and its definition as written.
 Does not: search the folders of a topology.
 """
 
@@ -26,53 +26,58 @@ from apc.compiler.topology.topology import Topology
 from apc.compiler.view.schema import in_unit, is_required, limits_of
 from apc.compiler.wording import side_by_side, wrapped
 
-TEMPLATE = "template"  # the topology that `apc new` writes where no other is asked for
+TEMPLATE = "template"  # the topology that `apc new` writes by default
 
 
 def library_lines(library: Library) -> Iterator[str]:
-    """Yield the components and connectors of a library, a line each, by folder."""
-    for room, rows in library_document(library).items():
-        yield room
+    """Yield the components and connectors of a library, one per line, by folder."""
+    for folder, rows in library_document(library).items():
+        yield folder
         yield from _lines({row["name"]: row["description"] for row in rows})
     yield "apc library NAME shows one: its parameters with units and limits, its equations."
 
 
-def _lines(abouts: dict[str, str]) -> Iterator[str]:
-    """Yield names with the first sentence of their descriptions, and an empty line."""
-    width = max(map(len, abouts))
-    for name, description in abouts.items():
+def _lines(descriptions: dict[str, str]) -> Iterator[str]:
+    """Yield names with the first sentence of their descriptions, then an empty line."""
+    width = max(map(len, descriptions))
+    for name, description in descriptions.items():
         yield from side_by_side(f"  {name:<{width}}", description.partition(". ")[0].rstrip("."))
     yield ""
 
 
 def library_document(library: Library) -> dict[str, Any]:
-    """Return the same as plain data, with complete descriptions."""
-    rooms: dict[str, list[dict[str, str]]] = {}
+    """Return the components and connectors of a library by folder, as plain data with complete
+    descriptions.
+    """
+    folders: dict[str, list[dict[str, str]]] = {}
     for name, path in library.files.items():
-        row = {"name": name, "description": _entry(library, name).description}
-        rooms.setdefault(path.resolve().parent.name, []).append(row)
-    return rooms
+        row = {"name": name, "description": _definition(library, name).description}
+        folders.setdefault(path.resolve().parent.name, []).append(row)
+    return folders
 
 
-def _entry(library: Library, name: str) -> Component | Connector:
-    """Return a component or connector. Raises ApcError (E206) where the library has none of that name."""
+def _definition(library: Library, name: str) -> Component | Connector:
+    """Return a component or connector by name.
+
+    Raises ApcError (E206) if the library has none of this name.
+    """
     if (result := library.component(name) or library.connector(name)) is None:
-        names = {name.lower(): name for name in library.names}
+        names = {known.lower(): known for known in library.names}
         near = names.get(nearest(name.lower(), names), "")
-        message = f"the library has no {name[:80] or 'nameless component'}"
+        message = f"unknown component {name[:80]!r}"
         raise ApcError(
-            Diagnostic("E206", SourceLocation("apc library"), message, hint=f"apc library {near}".rstrip())
+            Diagnostic("E206", SourceLocation("apc library"), message, fix=f"apc library {near}".rstrip())
         )
     return result
 
 
 def component_text(library: Library, name: str) -> str:
-    """Return a component of a library, or a connector, for a person to read.
+    """Return the text that describes a component or connector of a library.
 
     Raises
     ------
     ApcError
-        E206 there is none of that name.
+        E206 the library has no component or connector of this name.
     """
     facts = component_document(library, name)
     lines = [name, *wrapped(facts["description"], "  ", "  ")]
@@ -87,32 +92,32 @@ def component_text(library: Library, name: str) -> str:
             lines += side_by_side(f"  {cells}", row["description"])
         lines.append("")
     for title, text in facts["definitions"].items():
-        lines += [f"{title} as it is written:", "", *(f"  {line}" for line in text.splitlines()), ""]
+        lines += [f"Source of {title}:", "", *(f"  {line}" for line in text.splitlines()), ""]
     return "\n".join(lines).rstrip()
 
 
 def component_document(library: Library, name: str) -> dict[str, Any]:
-    """Return a component of a library, or a connector, as plain data: see `component_text`."""
-    result = _entry(library, name)
-    peer_type, whole = "component", result
-    if isinstance(whole, Connector):  # it has no listed parts
-        peer_type, whole = "connector", Component(name, result.description, "", SourceLocation(""))
-    vectors = by_vector(whole.parameters)
+    """Return the description of a component or connector as plain data, see `component_text`."""
+    result = _definition(library, name)
+    kind, definition = "component", result
+    if isinstance(definition, Connector):  # a connector has no parameters or equations
+        kind, definition = "connector", Component(name, result.description, "", SourceLocation(""))
+    vectors = by_vector(definition.parameters)
     return {
         "name": name,
-        "kind": peer_type,
-        "description": whole.description,
-        "source": whole.source,
+        "kind": kind,
+        "description": definition.description,
+        "source": definition.source,
         "file": str(library.files[name]),
-        "connectors": {local: related.name for local, related in whole.connectors},
-        "parameters": [_parameter(local, entries) for local, entries in vectors.items()],
-        "equations": [*dict.fromkeys(equation.text for equation in whole.equations)],
+        "connectors": {connector: type_.name for connector, type_ in definition.connectors},
+        "parameters": [_parameter(parameter, entries) for parameter, entries in vectors.items()],
+        "equations": [*dict.fromkeys(equation.text for equation in definition.equations)],
         "definitions": _definitions(library, name),
     }
 
 
 def _parameter(name: str, entries: list[Parameter]) -> dict[str, str]:
-    """Return the text of a parameter, or of the entries of a vector."""
+    """Return the description of a parameter, or of a vector given by its entries, as texts by column name."""
     entry, unit, value, limits = entries[0], "", "needed" if is_required(entries[0]) else "", ""
     if isinstance(entry, Option):
         value, limits = entry.default or "needed", ", ".join(entry.words)
@@ -127,7 +132,7 @@ def _parameter(name: str, entries: list[Parameter]) -> dict[str, str]:
 
 
 def _definitions(library: Library, name: str) -> dict[str, str]:
-    """Return the texts of a definition and of those it extends, by name."""
+    """Return the texts of a definition and of the definitions it extends, by name."""
     texts: dict[str, str] = {}
     while name:
         source = read_source(library.files[name])
@@ -136,7 +141,7 @@ def _definitions(library: Library, name: str) -> dict[str, str]:
 
 
 def _text(source: Source, key: str) -> str:
-    """Return the text of a key of a file, empty without one."""
+    """Return the text of a top-level key of a file, empty if there is none."""
     node = source.root.get(key) if isinstance(source.root, Mapping) else None
     return node.text if isinstance(node, Scalar) else ""
 
@@ -151,26 +156,24 @@ def topologies() -> dict[str, Path]:
 
 
 def topology_lines() -> Iterator[str]:
-    """Yield the topologies that come with the program, a line each."""
+    """Yield the topologies that come with the program, one per line."""
     yield from _lines({name: _text(read_source(path), "description") for name, path in topologies().items()})
     yield "apc new --like NAME copies one to NAME.yaml."
 
 
 def topology_named(name: str) -> Path:
-    """Return the file of a topology of the library. Raises ApcError (E206) where there is none of that
-    name.
-    """
+    """Return the file of a topology of the library. Raises ApcError (E206) for an unknown name."""
     known = topologies()
     if name not in known:
         near = nearest(name, known)
-        message = f"the library has no topology {name[:80]}"
-        hint = f"apc new --like {near}" if near else "apc new --list"
-        raise ApcError(Diagnostic("E206", SourceLocation("--like"), message, hint=hint))
+        message = f"unknown topology {name[:80]}"
+        fix = f"apc new --like {near}" if near else "apc new --list"
+        raise ApcError(Diagnostic("E206", SourceLocation("--like"), message, fix=fix))
     return known[name]
 
 
 def tables_of(topology: Path) -> tuple[Path, ...]:
-    """Return the files that a topology names from its folder."""
+    """Return the files that a topology refers to, relative to its folder."""
     built = run_stages(topology, until="topology")
     assert isinstance(built, Topology)
     return tuple(topology.parent / name for name in built.texts)

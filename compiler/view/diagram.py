@@ -1,11 +1,11 @@
-"""A topology as a graph: parts joined within a peer, peers joined over links; as text for Graphviz and
+"""A topology as a graph: connected parts of a peer, peers connected over links; as text for Graphviz and
 Mermaid.
 
 Takes: `Topology`. Gives: `Diagram` of `Box` and `DiagramEdge`, `build_diagram`; `draw_dot`, `draw_mermaid`;
 `node_of`, `shape_of`, `seconds`.
-Guarantees: every part of the topology is in it, a long array as one box; the same topology gives the same
-text.
-Does not: place anything on a page: `output.graph` does, or Graphviz, or Mermaid.
+Guarantees: the graph contains every part of the topology, a long array as one box; the same topology gives
+the same text.
+Does not: lay out the graph on a page (see `output.graph`, Graphviz, Mermaid).
 """
 
 from __future__ import annotations
@@ -29,17 +29,17 @@ from apc.compiler.topology.topology import Topology
 from apc.compiler.wording import counted
 
 ROLES = {"masses": "mass", "couplers": "coupler", "hands": "hand"}
-LONGEST_ARRAY = 4  # with more elements an array is one box
-MOST_LINES = 7  # of numbers in one box
-MOST_GROUPS = 8  # that are drawn
-LONGEST_EXPRESSION = 27  # characters shown behind its value, with the sign between them
+LONGEST_ARRAY = 4  # an array with more elements is one box
+MOST_LINES = 7  # numbers in one box
+MOST_GROUPS = 8  # groups drawn
+LONGEST_EXPRESSION = 27  # characters of an expression shown after its value, with the equals sign
 
 
 @dataclass(frozen=True, slots=True)
 class Box:
-    """A box of a part, a link or a group: its `lines`, with its name first.
+    """The box of a part, a link or a group; the first of `lines` is the name.
 
-    `role` is mass, coupler, hand, ground, joint, link or group; `clock` is the one a part or link ticks on.
+    `role` is mass, coupler, hand, ground, joint, link or group; `clock` is the clock of a part or link.
     """
 
     key: str
@@ -50,7 +50,7 @@ class Box:
 
 @dataclass(frozen=True, slots=True)
 class DiagramEdge:
-    """A line between two boxes, by their keys; `sent` if over a link."""
+    """A line between two boxes, given by their keys; `sent` if values are sent over a link."""
 
     item: str
     two: str
@@ -59,7 +59,7 @@ class DiagramEdge:
 
 @dataclass(frozen=True, slots=True)
 class Diagram:
-    """The graph of a topology: one peer's parts, the links, and the first of several groups."""
+    """The graph of a topology: the parts of one peer, the links, and the first groups."""
 
     topology: Topology
     boxes: tuple[Box, ...]
@@ -70,15 +70,16 @@ def build_diagram(topology: Topology) -> Diagram:
     """Return the graph of a topology."""
     by_name = {
         part.name: part for part in topology.parts if "." not in part.name
-    }  # the last: as it usually is
+    }  # of parts with the same name the last, which is of the ordinary type
     parts = [*by_name.values()]
-    sizes = Counter(_array(part.name) for part in parts)
+    sizes = Counter(_array_name(part.name) for part in parts)
     boxes: dict[str, Box] = {}
-    joined: dict[DiagramEdge, None] = {}
+    connections: dict[DiagramEdge, None] = {}
     sent: list[DiagramEdge] = []
 
     def shown(name: str) -> str:
-        return _array(name) if sizes[_array(name)] > LONGEST_ARRAY else name
+        """Return the name of the box of a part: the name of a long array instead of its elements."""
+        return _array_name(name) if sizes[_array_name(name)] > LONGEST_ARRAY else name
 
     for part in parts:
         if (name := shown(part.name)) not in boxes:
@@ -87,39 +88,40 @@ def build_diagram(topology: Topology) -> Diagram:
                 for parameter in part.component.parameters
                 if isinstance(parameter, Reference)
             }
-            named = [(roles[local], word) for local, word in part.references]
-            clock = next((word for role, word in named if role == "clock"), "")
+            references = [(roles[parameter], word) for parameter, word in part.references]
+            clock = next((word for role, word in references if role == "clock"), "")
             lines = _part_lines(topology, part, sizes[name] if name != part.name else 1)
             boxes[name] = Box(name, ROLES[part.section], (name, *lines), clock)
-            received = dict.fromkeys(word for role, word in named if role == "link")
+            received = dict.fromkeys(word for role, word in references if role == "link")
             sent += [DiagramEdge(name, f"link {link}", sent=True) for link in received]
     for part in parts:
         for _, other, _ in part.connections:
             text, two = shown(part.name), shown(other.partition(".")[0])
             if other == GROUND:
-                two = f"{GROUND} of {text}"  # each has its own: the ground joins nothing
+                two = f"{GROUND} of {text}"  # one ground for each part: the ground connects nothing
                 boxes[two] = Box(two, GROUND, (GROUND,))
             elif (boxes[text].role == "mass") == (boxes[two].role == "mass"):
-                # Parts of one role are joined rigidly, at a point of its own: the graph has two sides.
+                # A rigid connection of two parts of the same role has a joint: the graph is bipartite.
                 middle = f"{text} and {two}"
                 boxes[middle] = Box(middle, "joint", (middle,))
-                joined[DiagramEdge(middle, text, sent=False)] = None
+                connections[DiagramEdge(middle, text, sent=False)] = None
                 text = middle
-            joined[DiagramEdge(two, text, sent=False)] = None
+            connections[DiagramEdge(two, text, sent=False)] = None
     links, groups = [*map(_link_box, topology.links)], [*_group_boxes(topology)]
     sent += [DiagramEdge(link.key, group.key, sent=True) for link in links for group in groups]
-    return Diagram(topology, (*boxes.values(), *links, *groups), (*joined, *sent))
+    return Diagram(topology, (*boxes.values(), *links, *groups), (*connections, *sent))
 
 
-def _array(name: str) -> str:
+def _array_name(name: str) -> str:
+    """Return the name of an array from the name of an element."""
     return name.partition("[")[0]
 
 
 def _part_lines(topology: Topology, part: PartInstance, count: int) -> Iterator[str]:
-    """Yield the text of a part, or of an array of parts: its type, then its values."""
+    """Yield the lines of a part, or of an array of parts: the type, then the values."""
     component = part.component
     if count > 1:
-        yield f"{count} of them"
+        yield f"array of {count}"
     if component.name != DEFAULT_TYPES.get(part.section):
         yield component.name
     axes = {
@@ -138,24 +140,24 @@ def _part_lines(topology: Topology, part: PartInstance, count: int) -> Iterator[
 
 
 def _numbers(topology: Topology, part: PartInstance) -> Iterator[str]:
-    """Yield a part's nonzero numbers, start values, options other than the default, and tables."""
+    """Yield the nonzero numbers, start values, options without default value, and tables of a part."""
     for name, entries in by_vector(part.values, itemgetter(0)).items():
         if any(value.number for _, value in entries):
             yield f"{name} {_quantities(part, entries)}"
-        for local, value in entries:
-            if part.shared and getattr(part.component.parameter(local), "divided", False):
-                each = replace(value, number=value.number / topology.peers)
-                yield f"shared: {_quantity(part, local, each)} a copy"
+        for parameter, value in entries:
+            if part.shared and getattr(part.component.parameter(parameter), "divided", False):
+                of_copy = replace(value, number=value.number / topology.peers)
+                yield f"shared: {_quantity(part, parameter, of_copy)} per copy"
     for name, entries in by_vector(part.starts, itemgetter(0)).items():
         yield f"{name} starts at {_quantities(part, entries)}"
-    for local, word in part.options:
-        if word != getattr(part.component.parameter(local), "default", None):
-            yield f"{local} {word}"
+    for option, word in part.options:
+        if word != getattr(part.component.parameter(option), "default", None):
+            yield f"{option} {word}"
     yield from (f"{table.name}: a table of {len(table.times)} rows" for table in part.tables)
 
 
 def _quantities(part: PartInstance, entries: list[tuple[str, ScalarValue]]) -> str:
-    """Return a number with its unit and its expression, or the numbers of a vector's entries."""
+    """Return the text of a number with its unit and expression, or of the numbers of a vector."""
     first, *more = (_quantity(part, name, value) for name, value in entries)
     if more:
         return f"[{', '.join((first, *more))}]"
@@ -165,7 +167,7 @@ def _quantities(part: PartInstance, entries: list[tuple[str, ScalarValue]]) -> s
 
 
 def _quantity(part: PartInstance, name: str, value: ScalarValue) -> str:
-    """Return a number as written in the topology or its component, or the word that represents it."""
+    """Return the text of a number in the unit of the topology or component, or the word for the number."""
     declared = part.component.parameter(name) or part.component.variable(name)
     assert isinstance(declared, NumberParameter | ComponentVariable)
     for word, number in declared.words if isinstance(declared, NumberParameter) else ():
@@ -177,26 +179,28 @@ def _quantity(part: PartInstance, name: str, value: ScalarValue) -> str:
 
 
 def seconds(number: Fraction) -> str:
-    """Return a time for a person: in ms below a second."""
+    """Return the text of a time: in ms below one second, else in s."""
     return f"{float(number) * 1e3:.6g} ms" if abs(number) < 1 else f"{float(number):.6g} s"
 
 
 def _link_box(link: LinkDeclaration) -> Box:
+    """Return the box of a link, with its graph, clock, delays and channel."""
     delay, remarks = link.delay.number, () if link.channel is None else link.channel.remarks
-    later = f"available {seconds(delay)} later" if delay else "available at once"
-    lines = (link.name, shape_of(link), f"a packet each tick of {link.clock}", later)
-    delays = (f"{d.sender} to {d.receiver}: {seconds(d.delay.number)} later" for d in link.delays)
+    later = f"delay {seconds(delay)}" if delay else "no delay"
+    lines = (link.name, shape_of(link), f"one packet per tick of {link.clock}", later)
+    delays = (f"{d.sender} to {d.receiver}: delay {seconds(d.delay.number)}" for d in link.delays)
     return Box(f"link {link.name}", "link", (*lines, *delays, *remarks), link.clock)
 
 
 def _group_boxes(topology: Topology) -> Iterator[Box]:
+    """Yield the boxes of the groups, with their settings; at most `MOST_GROUPS`."""
     for group in topology.groups[:MOST_GROUPS]:
         lines = [f"{name}.type {word}" for name, word in group.types]
         for name, value in group.values:
-            part, _, local = name.rpartition(".")
-            lines.append(f"{name} {_quantities(topology.part(part), [(local, value)])}")
+            part, _, parameter = name.rpartition(".")
+            lines.append(f"{name} {_quantities(topology.part(part), [(parameter, value)])}")
         lines += [f"{name} {word}" for name, word in group.words]
-        lines += [f"{name} of its own for each peer" for name, _ in group.columns]
+        lines += [f"{name} individual for each peer" for name, _ in group.columns]
         title = f"{group.name}: {counted(group.count, 'peer', ',')}"
         yield Box(f"group {group.name}", "group", (title, *lines[:MOST_LINES]))
     if (more := len(topology.groups) - MOST_GROUPS) > 0:
@@ -204,12 +208,12 @@ def _group_boxes(topology: Topology) -> Iterator[Box]:
 
 
 def node_of(topology: Topology) -> str:
-    """Return the description of the drawn peer."""
+    """Return the text for the peer that the diagram shows."""
     return "the only peer" if topology.peers == 1 else f"one of {topology.peers} peers"
 
 
 def shape_of(link: LinkDeclaration) -> str:
-    """Return the communication graph of a link, in words."""
+    """Return the text for the communication graph of a link."""
     graph = link.graph
     return counted(len(graph.arcs), "arc") if graph.shape == "arcs" else f"{graph.shape} graph"
 
@@ -244,5 +248,6 @@ def draw_mermaid(diagram: Diagram) -> str:
 
 
 def _quoted(text: str) -> str:
+    """Return a text as a quoted string of Graphviz."""
     escaped = text.replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n")
     return f'"{escaped}"'

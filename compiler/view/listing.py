@@ -13,14 +13,15 @@ import math
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict
 from fractions import Fraction
-from itertools import chain
+from itertools import chain, groupby
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
 from apc.compiler.compiled import Model
 from apc.compiler.equations.causalization import SortedPeerType
 from apc.compiler.equations.clocks import ClockedPeerType
-from apc.compiler.equations.flatten import FlatPeerType
+from apc.compiler.equations.flatten import FlatPeerType, FlatSystem
 from apc.compiler.equations.solution import Assignment, ImplicitBlock
 from apc.compiler.equations.terms import text_of
 from apc.compiler.language.unit_text import format_dimension
@@ -28,10 +29,19 @@ from apc.compiler.multiples import common_multiple
 from apc.compiler.pipeline import each_stage, run_stages
 from apc.compiler.topology.topology import Topology
 from apc.compiler.view.diagram import Diagram, build_diagram, node_of, seconds, shape_of
-from apc.compiler.view.stages import describe
+from apc.compiler.view.stages import sent_text
 from apc.compiler.wording import wrapped
 
 PAIRWISE = ("max", "min")
+
+# The labels of facts of the schedule that differ from their keys.
+LABELS = {
+    "kind": "peer type",
+    "ticks": "ticks per frame",
+    "on_the_way": "packets in transit",
+    "age_s": "data age",
+    "receive": "received",
+}
 
 
 def show_text(path: Path) -> str:
@@ -39,13 +49,9 @@ def show_text(path: Path) -> str:
     stages: dict[str, Any] = dict(each_stage(path))
     topology: Topology = stages["topology"]
     lines = [topology.name, *wrapped(topology.description)]
-    lines += ["", f"GRAPH of {node_of(topology)}", *_graph_lines(build_diagram(topology))]
-    for title, stage in (("EQUATIONS", "flat"), ("COMPUTED", "sorted")):
-        lines += ["", title]
-        for line in describe(stages[stage]).splitlines():
-            indent = " " * (2 + len(line) - len(line.lstrip()))
-            lines += wrapped(line, indent, indent + "    ")
-    return "\n".join([*lines, "", "SCHEDULE", *_schedule_lines(schedule(stages["compiled"]))])
+    lines += ["", f"Graph of {node_of(topology)}", "", *_graph_lines(build_diagram(topology))]
+    lines += _equation_lines(stages["flat"])
+    return "\n".join([*lines, "", "Schedule", "", *_schedule_lines(schedule(stages["compiled"]))])
 
 
 def show_document(path: Path) -> dict[str, Any]:
@@ -76,9 +82,9 @@ def show_document(path: Path) -> dict[str, Any]:
 
 
 def _peer_type_document(
-    flat: FlatPeerType, clocked: ClockedPeerType, ordered: SortedPeerType
+    flat: FlatPeerType, clocked: ClockedPeerType, sorted_type: SortedPeerType
 ) -> dict[str, Any]:
-    """Return the equations of the peers of one structure, as they are written and as they are computed."""
+    """Return the equations of a peer type as plain data, as written and as computed."""
     return {
         "name": flat.name,
         "groups": flat.groups,
@@ -88,16 +94,17 @@ def _peer_type_document(
             {"clock": p.clock, "variables": p.variables, "equations": [e.text for e in p.equations]}
             for p in clocked.partitions
         ],
-        "states": ordered.states,
-        "aliases": _computed(ordered.aliases),
+        "states": sorted_type.states,
+        "aliases": _computed(sorted_type.aliases),
         "computed": [
-            {"clock": p.clock, "steps": [*map(_step_document, p.assignments)]} for p in ordered.partitions
+            {"clock": p.clock, "steps": [*map(_step_document, p.assignments)]} for p in sorted_type.partitions
         ],
-        "sent": [{"name": s.name, "link": s.link, "is": text_of(s.expression)} for s in ordered.sends],
+        "sent": [{"name": s.name, "link": s.link, "is": text_of(s.expression)} for s in sorted_type.sends],
     }
 
 
 def _step_document(step: Assignment | ImplicitBlock) -> dict[str, Any]:
+    """Return an assignment or a nonlinear loop as plain data."""
     if not isinstance(step, ImplicitBlock):
         return {"name": step[0], "is": str(step[1])}
     inner, zero = _computed(step.inner), [str(residual) for residual in step.residuals]
@@ -105,6 +112,7 @@ def _step_document(step: Assignment | ImplicitBlock) -> dict[str, Any]:
 
 
 def _computed(values: Iterable[Assignment]) -> list[dict[str, str]]:
+    """Return assignments as plain data."""
     return [{"name": name, "is": text_of(value)} for name, value in values]
 
 
@@ -116,25 +124,54 @@ def diagram_of(path: Path) -> Diagram:
 
 
 def _graph_lines(diagram: Diagram) -> Iterator[str]:
-    """Yield each part, link and group, with its connections."""
+    """Yield each part, link and group, with its clock and its connections."""
     titles = {box.key: box.lines[0] for box in diagram.boxes}
     for box in diagram.boxes:
-        ticks = [f"at each tick of {box.clock}"] if box.clock and box.role != "link" else []
+        ticks = [f"clock {box.clock}"] if box.clock and box.role != "link" else []
         description = ", ".join((*box.lines[1:], *ticks))
         yield from wrapped(": ".join(filter(None, (box.lines[0], description))), "  ", "    ")
         ends = ({edge.item, edge.two} for edge in diagram.edges)
         joined = ", ".join(titles[other] for pair in ends if box.key in pair for other in pair - {box.key})
-        yield from wrapped(f"joined to {joined}" if joined else "", "    ", "      ")
+        yield from wrapped(f"connected to {joined}" if joined else "", "    ", "      ")
+
+
+# ---- equations ----
+
+
+def _equation_lines(flat: FlatSystem) -> Iterator[str]:
+    """Yield the unknowns and equations of each peer type, by part; equal peer types are listed once."""
+    listed: dict[tuple[object, ...], str] = {}
+    for peer_type in flat.peer_types:
+        sends = tuple((send.link, sent_text(send)) for send in peer_type.sends)
+        equations = tuple((equation.origin, equation.text) for equation in peer_type.equations)
+        first = listed.setdefault((equations, sends), peer_type.name)
+        if first != peer_type.name:
+            yield from ("", f"Equations of peer type {peer_type.name}: identical to those of {first}")
+            continue
+        count, unknowns = len(equations), len(peer_type.variables)
+        yield from ("", f"Equations of peer type {peer_type.name}: {count} equations, {unknowns} unknowns")
+        names: dict[str, list[str]] = {}
+        for variable in peer_type.variables:
+            names.setdefault(format_dimension(variable.dimension), []).append(variable.name)
+        yield ""
+        for unit, group in names.items():
+            yield from wrapped(f"unknowns [{unit}]: {', '.join(group)}", "  ", "    ")
+        yield ""
+        titled = [*equations, *((f"packets over {link}", text) for link, text in sends)]
+        for origin, rows in groupby(titled, key=itemgetter(0)):
+            yield f"  {origin}"
+            for _, text in rows:
+                yield from wrapped(text, "    ", "        ")
 
 
 # ---- the schedule ----
 
 
 def schedule(system: Model) -> dict[str, Any]:
-    """Return the events of one frame: clocks, holds, links, and received values; times in seconds.
+    """Return the events of one frame as plain data: clocks, holds, links and received values.
 
-    `in_flight` is the largest number of a sender's packets in transit; the newest delivered one has the age
-    `age_s` between its arrival and that of the next.
+    Times are in seconds. `on_the_way` is the largest number of packets of one sender in transit; `age_s` has
+    the age of the newest delivered packet at its arrival and at the arrival of the next.
     """
     timings = {timing.name: timing.value for timing in system.timings}
     periods = {clock.name: timings[clock.period] for clock in system.clocks}
@@ -212,20 +249,20 @@ def schedule(system: Model) -> dict[str, Any]:
 
 
 def _schedule_lines(facts: dict[str, Any]) -> Iterator[str]:
-    """Yield clocks, holds, links and receives, each with its description; empty sections are omitted."""
+    """Yield the lines of clocks, holds, links and received values."""
     frame, *tables = facts.values()
     if frame is None:
-        yield "  No clock ticks: everything is continuous."
+        yield "  no clocks: all equations are continuous"
         return
-    yield f"  frame of {seconds(Fraction(frame))}, after which every clock stands as before"
+    yield f"  frame {seconds(Fraction(frame))} (least common multiple of the clock periods)"
     for row in chain(*tables):
         texts = (_shown(key, value) for key, value in row.items() if value)
         yield from wrapped(", ".join(texts), "  ", "    ")
 
 
 def _shown(key: str, value: Any) -> str:
-    """Return a fact as text, times with their unit; one that holds needs no more than its name."""
-    name, texts = key.removesuffix("_s").replace("_", " "), value if isinstance(value, list) else [value]
+    """Return a fact of the schedule as text, times with their unit; a true fact as its name."""
+    name, texts = LABELS.get(key, key.removesuffix("_s")), value if isinstance(value, list) else [value]
     if value is True:
         return name
     if key.endswith("_s"):

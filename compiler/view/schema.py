@@ -1,11 +1,12 @@
-"""The language of topologies as a JSON Schema, so that an editor completes and checks while one types.
+"""The language of topologies as a JSON Schema, for completion and checks in an editor.
 
 Takes: a `LoadedLibrary`. Gives: `topology_schema`, a JSON Schema document (draft 2020-12); `limits_of`,
 `in_unit`, `is_required` of a declared parameter.
-Guarantees: what the compiler accepts fits it; the same library gives the same document.
-Does not: catch everything: names that refer to each other, and bounds in other units, stay the compiler's.
+Guarantees: every topology accepted by the compiler is valid; the same library gives the same document.
+Does not: find all errors: references between names, and bounds in other units, are checked only by the
+compiler.
 
-What no component adds to is written in schema.yaml.
+The definitions that do not depend on components are in schema.yaml.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ from apc.compiler.topology.topology import SECTIONS
 Schema = dict[str, Any]
 
 BASE = Path(__file__).with_suffix(".yaml")
-# Any unit is valid; for these an editor can check or suggest immediately.
+# All units are valid; these can be checked and proposed by an editor.
 EVERYDAY_UNITS = (
     *("kg", "g", "mg", "m", "mm", "cm", "um", "s", "ms", "us", "min", "h", "Hz", "kHz"),
     *("N", "mN", "kN", "N/m", "N/mm", "kN/m", "N*s/m", "m/s", "mm/s", "rad", "deg"),
@@ -45,27 +46,27 @@ _NUMBER = r"[+-]?\s*(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?(\s*/\s*\d+\.?\d*)?"
 
 
 def topology_schema(library: Library) -> Schema:
-    """Return the schema of a topology whose parts are of the library's components."""
+    """Return the JSON Schema of topologies with the components of a library."""
     base: Schema = yaml.safe_load(BASE.read_text(encoding="utf-8"))
     components = [c for name in library.component_names if (c := library.component(name)) is not None]
     quantities: dict[str, Schema] = {}
     _quantity(parse_unit("s", SourceLocation("schema")), quantities)
     _quantity(parse_unit("s", SourceLocation("schema")), quantities, or_rate=True)
     parts = {component.name: _part(component, quantities) for component in components}
-    joined = {
-        # A connector that another part names may be left out, but hardly all of them.
+    connection_rules = {
+        # A connector that another part names may be omitted, but at least one is required.
         c.name: {"anyOf": [{"required": [name]} for name, _ in c.connectors]}
         for c in components
         if c.connectors
     }
     of_parts = {
         "part": _by_type({name: {"$ref": f"#/$defs/{name}"} for name in parts}),
-        "joined_part": _by_type(joined),
+        "joined_part": _by_type(connection_rules),
     }
     types = {"properties": {"type": {"enum": list(parts)}}}
     return {
         **base,
-        # Components of one's own are known to the compiler alone.
+        # A user's own components are not in the schema.
         "if": {"not": {"required": ["library"]}},
         "then": {"properties": {section: {"additionalProperties": types} for section in SECTIONS}},
         "$defs": {**base["$defs"], **of_parts, **quantities, **parts},
@@ -73,7 +74,7 @@ def topology_schema(library: Library) -> Schema:
 
 
 def _by_type(choices: dict[str, Schema]) -> Schema:
-    """Return the schema with conditions on an object by its type."""
+    """Return a schema with a condition for each type of an object."""
     return {
         "allOf": [
             {"if": {"properties": {"type": {"const": name}}, "required": ["type"]}, "then": schema}
@@ -83,21 +84,25 @@ def _by_type(choices: dict[str, Schema]) -> Schema:
 
 
 def _quantity(unit: Unit, quantities: dict[str, Schema], *, or_rate: bool = False) -> Schema:
-    """Return a reference to the schema of quantities that fit a unit, which is added to the others."""
-    plain = format_dimension(unit.dimension).replace("*", "_").replace("/", "_per_")
-    name = f"quantity_{re.sub(r'[^a-zA-Z0-9_]', '', plain)}{'_or_rate' if or_rate else ''}"
+    """Return a reference to the schema of quantities of a unit's dimension, added to `quantities` on
+    first use.
+
+    With `or_rate`, quantities of the reciprocal dimension are valid too.
+    """
+    dimension_text = format_dimension(unit.dimension).replace("*", "_").replace("/", "_per_")
+    name = f"quantity_{re.sub(r'[^a-zA-Z0-9_]', '', dimension_text)}{'_or_rate' if or_rate else ''}"
     if name not in quantities and unit.text == "1":
         description = "a number without a unit, or an expression"
         quantities[name] = {"type": ["number", "string"], "description": description}
     elif name not in quantities:
         dimensions = {text: parse_unit(text, SourceLocation("schema")).dimension for text in EVERYDAY_UNITS}
-        fits = {unit.dimension, unit.dimension.power(-1)} if or_rate else {unit.dimension}
-        wrong = "|".join(re.escape(text) for text, d in dimensions.items() if d not in fits)
-        right = [text for text, dimension in dimensions.items() if dimension in fits] or [unit.text]
+        valid = {unit.dimension, unit.dimension.power(-1)} if or_rate else {unit.dimension}
+        other_units = "|".join(re.escape(text) for text, d in dimensions.items() if d not in valid)
+        right = [text for text, dimension in dimensions.items() if dimension in valid] or [unit.text]
         quantities[name] = {
             "type": "string",
             # No bare number, none with an everyday unit of another dimension, no text without a letter.
-            "pattern": rf"^(?!\s*{_NUMBER}\s*({wrong})?\s*$)[\s\S]*[A-Za-z°%µΩ]",
+            "pattern": rf"^(?!\s*{_NUMBER}\s*({other_units})?\s*$)[\s\S]*[A-Za-z°%µΩ]",
             "description": f"a number and its unit, such as 1 {unit.text}, or an expression",
             "examples": [f"1 {text}" for text in right],
         }
@@ -105,7 +110,7 @@ def _quantity(unit: Unit, quantities: dict[str, Schema], *, or_rate: bool = Fals
 
 
 def _part(component: Component, quantities: dict[str, Schema]) -> Schema:
-    """Return the schema of a part of a component, its connectors left optional."""
+    """Return the schema of a part with a component; its connectors are optional."""
     properties: dict[str, Schema] = {
         "type": {"const": component.name},
         **{key: {"$ref": f"#/$defs/{key}"} for key in PART_KEYS},
@@ -122,7 +127,7 @@ def _part(component: Component, quantities: dict[str, Schema]) -> Schema:
     if any(
         isinstance(parameter, Reference) and parameter.role == "delays" for parameter in component.parameters
     ):
-        delay = properties["delay"]  # which of a link may be a range
+        delay = properties["delay"]  # the delay of a link may be a range
         ends = {"type": "array", "prefixItems": [delay, delay], "minItems": 2, "maxItems": 2}
         properties["delay"] = {"anyOf": [delay, ends]}
     required = dict.fromkeys(whole_and_index(p.name)[0] for p in component.parameters if is_required(p))
@@ -136,7 +141,7 @@ def _part(component: Component, quantities: dict[str, Schema]) -> Schema:
 
 
 def _settable(name: str, parameter: Settable, quantities: dict[str, Schema]) -> Schema:
-    """Return the schema of a parameter or a start value; `name` is that of the vector it is an entry of."""
+    """Return the schema of a parameter or a start value; `name` is its name, or the name of its vector."""
     if isinstance(parameter, ComponentVariable):
         description = f"start value of the {parameter.description or name}"
         return _quantity(parameter.unit, quantities) | {"description": description}
@@ -168,12 +173,12 @@ def limits_of(parameter: NumberParameter) -> list[str]:
 
 
 def in_unit(parameter: NumberParameter, number: Any) -> str:
-    """Return a number in SI as text, in the unit that a parameter declares."""
+    """Return the text of an SI number in the declared unit of a parameter."""
     return f"{float(number / parameter.unit.scale):.12g}"
 
 
 def is_required(parameter: Parameter) -> bool:
-    """Return whether a part must give a parameter itself."""
+    """Return whether the entry of a part must have a parameter."""
     if isinstance(parameter, Reference):
         return parameter.role in ("clock", "link", "table")
     return parameter.default is None

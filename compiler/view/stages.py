@@ -1,8 +1,8 @@
-"""The value of any stage before the last as text for a person to read: the output of `apc compile --until`.
+"""The result of a stage before the last as text: the output of `apc compile --until`.
 
-Takes: the value of a stage. Gives: `describe`.
+Takes: the result of a stage. Gives: `describe`, `sent_text`.
 Guarantees: the same topology gives the same bytes.
-Does not: compute anything new.
+Does not: compute new values.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from apc.compiler.view.diagram import build_diagram
 
 
 def describe(value: Source | Topology | FlatSystem | ClockedSystem | SortedSystem) -> str:
-    """Return the value of a stage as text."""
+    """Return the text of the result of a stage."""
     match value:
         case Source():
             lines = _nodes(value.root, "")
@@ -39,6 +39,7 @@ def describe(value: Source | Topology | FlatSystem | ClockedSystem | SortedSyste
 
 
 def _nodes(node: Node, indent: str) -> Iterator[str]:
+    """Yield the lines of a YAML node, with locations."""
     location = f"{node.location.line}:{node.location.column}"
     if isinstance(node, Scalar):
         yield f"{indent}{node.text!r}  ({type(node.value).__name__}, {location})"
@@ -53,6 +54,7 @@ def _nodes(node: Node, indent: str) -> Iterator[str]:
 
 
 def _topology(topology: Topology) -> Iterator[str]:
+    """Yield the lines of a topology: clocks, parameters, parts and their connections."""
     yield f"topology {topology.name}: {topology.description}"
     yield from (f"clock {c.name}: every {c.period}, first at {c.phase}" for c in topology.clocks)
     for name, value in topology.parameters:
@@ -65,6 +67,7 @@ def _topology(topology: Topology) -> Iterator[str]:
 
 
 def _flat(flat: FlatSystem) -> Iterator[str]:
+    """Yield the lines of flat equations, by peer type."""
     for peer_type in flat.peer_types:
         yield (
             f"kind {peer_type.name}: {len(peer_type.equations)} equations, {len(peer_type.variables)} "
@@ -72,14 +75,16 @@ def _flat(flat: FlatSystem) -> Iterator[str]:
         )
         yield from (f"  unknown {v.name} [{format_dimension(v.dimension)}]" for v in peer_type.variables)
         yield from (f"  {e.text}    # {e.origin}" for e in peer_type.equations)
-        yield from map(_sent, peer_type.sends)
+        yield from (f"  send over {send.link}: {sent_text(send)}" for send in peer_type.sends)
 
 
-def _sent(send: FlatSend) -> str:
-    return f"  send over {send.link}: {send.name} = {format_expression(send.expression)}"
+def sent_text(send: FlatSend) -> str:
+    """Return the equation of a sent value."""
+    return f"{send.name} = {format_expression(send.expression)}"
 
 
 def _clocked(clocked: ClockedSystem) -> Iterator[str]:
+    """Yield the lines of partitions and crossings, by peer type."""
     for peer_type in clocked.peer_types:
         yield f"kind {peer_type.flat.name}"
         for partition in peer_type.partitions:
@@ -91,10 +96,11 @@ def _clocked(clocked: ClockedSystem) -> Iterator[str]:
         yield from (f"  previous on {p.clock}: {p.variable}" for p in peer_type.previous)
         for r in peer_type.receives:
             yield f"  receive on {r.clock} over {r.link}: {r.operator} of {format_expression(r.argument)}"
-        yield from map(_sent, peer_type.flat.sends)
+        yield from (f"  send over {send.link}: {sent_text(send)}" for send in peer_type.flat.sends)
 
 
 def _sorted(system: SortedSystem) -> Iterator[str]:
+    """Yield the lines of explicit equations in order of evaluation, by peer type."""
     for peer_type in system.peer_types:
         yield f"kind {peer_type.clocked.flat.name}: states {', '.join(peer_type.states)}"
         yield from (f"  alias {name} = {text_of(expression)}" for name, expression in peer_type.aliases)
@@ -107,7 +113,9 @@ def _sorted(system: SortedSystem) -> Iterator[str]:
 
 
 def _step(step: Assignment | ImplicitBlock) -> Iterator[str]:
-    """Yield an assignment, or a nonlinear loop: its iteration chain, then the values computed in it."""
+    """Yield the lines of an assignment, or of a nonlinear loop: tearing unknowns, computed values and
+    residuals.
+    """
     if not isinstance(step, ImplicitBlock):
         yield f"    {step[0]} := {text_of(step[1])}"
         return

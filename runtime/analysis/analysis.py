@@ -1,8 +1,8 @@
 """Stability analysis: from a compiled model to its spectrum and verdict.
 
-Takes: a `Model`.
+Takes: a `NumericModel`.
 Gives: `Analysis`, `analyze`; `prepare_at_start` for many analyses of one model; `lifted_groups`;
-`near_start`; `analyze_sides`.
+`near_start`; `analyze_sides`, `analyze_worst_side`.
 Guarantees: the cost grows with the number of different peers, not of all, and not with the length of a delay;
 equal input gives equal output.
 Does not: read files, or draw.
@@ -20,32 +20,26 @@ import numpy as np
 
 from apc.analysis.method_selection import cannot_serve, make_plan, refuse_varying
 from apc.analysis.nonlinear_elements import replaced_elements
-from apc.analysis.one_sided_slopes import Side, SideVerdict, sides, worst_side
+from apc.analysis.one_sided_slopes import Side, SideVerdict, severity, sides, worst_side
 from apc.compiler.compiled import LENGTH, Model
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.timings import part
-from apc.eigen.equilibrium import equilibrium_residual
-from apc.eigen.interconnection import ModalSystem, close_loop
-from apc.eigen.modes import decompose
-from apc.eigen.peer_classes import (
-    MOST_STATES,
-    PeerClass,
-    peer_groups,
-    representatives,
-    states_of,
-    used_coupling_terms,
-)
-from apc.eigen.rigid_modes import NeutralModes, classify_neutral_modes
-from apc.eigen.spectrum import Mode, Spectrum, solve_spectrum, up_to
-from apc.frame.communication_graph import CommunicationGraph
-from apc.frame.data_age import linear_subsystems
-from apc.frame.discretize import TOO_LARGE
-from apc.frame.evaluation_errors import finite_equations
-from apc.frame.numeric_model import Instance, Prepared, instance, linearized_at_start, prepare
-from apc.frame.parameter_names import ParameterRef
+from apc.lifting.discretize import TOO_LARGE
+from apc.lifting.numeric_model import NumericModel, linearized_at_start
+from apc.linearization.evaluation_errors import finite_equations
 from apc.network.nominal_criterion import limitations, unreliable
+from apc.parameter_values.parameter_names import ParameterRef
 from apc.result import PlotStyle, Result
-from apc.threads import single_threaded
+from apc.spectrum.enclosure import WIDE
+from apc.spectrum.equilibrium import equilibrium_residual
+from apc.spectrum.interconnection import ModalSystem, close_loop
+from apc.spectrum.modes import decompose
+from apc.spectrum.peer_classes import PeerClass, peer_groups, representatives, states_of, used_coupling_terms
+from apc.spectrum.rigid_modes import NeutralModes, classify_neutral_modes
+from apc.spectrum.spectrum import Mode, Spectrum, solve_spectrum, up_to
+from apc.support.state_limits import MATRIX_STATES
+from apc.support.threads import single_threaded
+from apc.timing.communication_graph import CommunicationGraph
 from apc.verdict import (
     NO_PROOF,
     Limitation,
@@ -58,11 +52,11 @@ from apc.verdict import (
 )
 
 NOT_LINEAR = (
-    "left out: the topology is not linear, and this holds near its start values only: of contacts and limits "
-    "those that act there"
+    "nonlinear topology: the result holds near the initial state, with the contacts and limits that are "
+    "active there"
 )
 
-SETTLED = 0.02  # of the start: a motion counts as settled
+SETTLED = 0.02  # of the initial deviation: below it a motion counts as settled
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,12 +65,12 @@ class Analysis(Result):
 
     `states_per_peer` is that of the largest peer type in the model. `method` is one of `methods.METHODS`.
     `linearized` states that some subsystem is not affine: the result then holds near its start values only.
-    `notes` are the reasons for the method; `proof` is the result of ball arithmetic, "" where floats decided;
-    `limitations` are the limitations. Of the rigid modes `translations` and `rotations` move something; the
-    others are those of the unobservable memories that `unobservable` names. `radius_excess` bounds the excess
-    of the radius over 1 from below and above, where that was proved: possibly closer to 1 than two floats.
-    `sides` are the verdicts of all sides of the kinks at which peers start, empty without kinks; the analysis
-    is that of the worst side.
+    `notes` are the reasons for the method; `proof` is the result of ball arithmetic, empty where floats
+    decided; `limitations` are the limitations of the result. Of the rigid modes, `translations` and
+    `rotations` are motions; the others belong to the unobservable memories named in `unobservable`.
+    `radius_excess` bounds the spectral radius less 1 from below and above if that was proved, closer than two
+    floats can. `sides` are the verdicts of all sides of the kinks at which peers start, empty without kinks;
+    the analysis is that of the worst side.
     """
 
     shown_by = "analysis_output:analysis"
@@ -103,12 +97,16 @@ class Analysis(Result):
     sides: tuple[SideVerdict, ...] = ()
 
     def plot(self, ax: Any = None, **style: Unpack[PlotStyle]) -> Any:
-        """Draw the eigenvalues over the unit circle into matplotlib Axes, or a figure's, in style `look`."""
+        """Draw the eigenvalues and the unit circle into matplotlib Axes, or a new figure, in the style
+        `look`.
+        """
         return self._plotted(ax, style=style)
 
     @property
     def settling_s(self) -> float | None:
-        """Settling time of the slowest mode to `SETTLED`, in seconds; None if it does not decay.
+        """Settling time of the slowest mode to `SETTLED` of the start, in seconds.
+
+        It is None if the mode does not decay.
 
         frame · ln(`SETTLED`)/ln(spectral radius): independent of the length of the frame.
         """
@@ -119,20 +117,16 @@ class Analysis(Result):
         )
 
 
-def prepare_at_start(
-    system: Model, prepared: Prepared, varied: Sequence[ParameterRef] = ()
-) -> Prepared | None:
-    """Return the prepared data with every peer type linearized at its start, over its parameters.
+def prepare_at_start(numeric: NumericModel, varied: Sequence[ParameterRef] = ()) -> NumericModel | None:
+    """Return a model with every peer type linearized at its start, as functions of its parameters.
 
-    None where that is impossible: see `numeric_model.linearized_at_start`; and where peers start at a kink:
-    each point is then analyzed on all sides.
+    None if that is impossible (see `numeric_model.linearized_at_start`), or if peers start at a kink: each
+    point is then analyzed on all sides.
 
     Parameters
     ----------
-    system
-        The compiled model.
-    prepared
-        From `prepare`, of this model.
+    numeric
+        The model with its parameter values.
     varied
         The parameters that will have other values.
 
@@ -141,69 +135,67 @@ def prepare_at_start(
     ApcError
         As `method_selection.refuse_varying` and `one_sided_slopes.sides`.
     """
-    refuse_varying(system, prepared.jacobians)
-    if sides(system, prepared)[0].system is not system:
+    refuse_varying(numeric.model, numeric.jacobians)
+    if sides(numeric)[0].numeric is not numeric:
         return None
-    return linearized_at_start(system, prepared, varied)
+    return linearized_at_start(numeric, varied)
 
 
-def near_start(system: Model, prepared: Prepared | None = None) -> tuple[str, ...]:
-    """Return the limitations of a linearized result, empty for a linear model.
+def near_start(numeric: NumericModel) -> tuple[str, ...]:
+    """Return the limitations of a result that holds near the start values only; empty for a linear model.
 
     Parameters
     ----------
-    system
-        The compiled model.
-    prepared
-        From `prepare`, of this model with any parameter values.
+    numeric
+        The model with its parameter values.
     """
-    subsystems = prepared.jacobians if prepared else linear_subsystems(system)
-    elements = replaced_elements(system)
-    if all(subsystems[group.peer_type].affine for group in system.groups):
+    elements = replaced_elements(numeric.model)
+    if numeric.affine:
         return elements
     try:
-        listed = sides(system, prepared or prepare(system))
-        groups, _ = lifted_groups(listed[0].system, prepared=listed[0].prepared)
+        all_sides = sides(numeric)
+        groups, _ = lifted_groups(all_sides[0].numeric)
     except ApcError:  # no result with these values
         return (*elements, NOT_LINEAR)
-    return (*_of_sides([side.name for side in listed]), *elements, *_near_start(groups))
+    return (*_kink_limitation([side.name for side in all_sides]), *elements, *_start_limitations(groups))
 
 
-def _of_sides(names: Sequence[str]) -> tuple[str, ...]:
-    """Return the limitation of a result at a kink."""
+def _kink_limitation(names: Sequence[str]) -> tuple[str, ...]:
+    """Return the limitation of a result at a kink with these names of sides; empty without a kink."""
     if len(names) < 2:
         return ()
     shown = " or ".join(names) if len(names) == 2 else f"{len(names)} combinations of sides"
     return (f"the start is at a kink ({shown}): the worst side decides",)
 
 
-def _near_start(groups: Sequence[PeerClass]) -> tuple[str, ...]:
+def _start_limitations(groups: Sequence[PeerClass]) -> tuple[str, ...]:
+    """Return the limitations of a linearized model: a motion at the start values, and the nonlinearity."""
     moves = equilibrium_residual(groups)
-    return (*([f"{moves}; what happens is played: apc simulate"] if moves else []), NOT_LINEAR)
+    return (
+        *([f"{moves}; for the motion over time, run apc simulate"] if moves else []),
+        NOT_LINEAR,
+    )
 
 
 @part("analysis")
 def analyze(
-    system: Model,
+    numeric: NumericModel,
     *,
     method: str = "auto",
-    prepared: Prepared | None = None,
     certify: bool = False,
 ) -> Analysis:
-    """Analyze a model by the method that suits it, or by the requested one.
+    """Return the stability analysis of a model by the fastest applicable method, or by the method named.
 
-    Where peers start at a kink every side is analyzed, and the result is that of the worst one.
+    Where peers start at a kink every side is analyzed, and the result is that of the worst side.
 
     Parameters
     ----------
-    system
-        The compiled model, with the parameter values to analyse (see `overrides.apply`).
+    numeric
+        The model with its parameter values.
     method
-        One of `methods.METHODS`. "modes": a few small systems, where equal peers and the graph allow that;
+        One of `methods.METHODS`. "modes": a few small systems, if equal peers and the graph allow them;
         "dense": all peers as one matrix, the reference, at the cost of N³; "determinant": the zeros of a
         small characteristic function, for different peers on complete graphs and for delays of any length.
-    prepared
-        From `prepare`, of this model with any parameter values; avoids building the Jacobians again.
     certify
         Prove the verdict in ball arithmetic, also where floats decide it.
 
@@ -211,63 +203,129 @@ def analyze(
     ------
     ApcError
         E804 a system of too many states for its matrix, E806 an overflow, E850 a method that is not
-        applicable; and those of `one_sided_slopes.sides`, `method_selection.refuse_varying` and
+        applicable; the errors of `one_sided_slopes.sides`, `method_selection.refuse_varying` and
         `peer_classes.peer_groups`.
     """
-    return analyze_sides(system, method=method, prepared=prepared, certify=certify)[0]
+    return analyze_sides(numeric, method=method, certify=certify)[0]
 
 
-def analyze_sides(
-    system: Model, *, method: str, prepared: Prepared | None, certify: bool
-) -> tuple[Analysis, Side]:
-    """Return the analysis of the worst side, and that side.
+def analyze_sides(numeric: NumericModel, *, method: str, certify: bool) -> tuple[Analysis, Side]:
+    """Return the analysis of the worst side of a kink, and this side; without a kink, of the model.
 
     Parameters
     ----------
-    system, method, prepared, certify
+    numeric, method, certify
         As for `analyze`.
     """
-    listed = sides(system, prepared or prepare(system))
-    each = [_analyze(side.system, method=method, prepared=side.prepared, certify=certify) for side in listed]
+    return analyze_worst_side(sides(numeric), method=method, certify=certify)
+
+
+def analyze_worst_side(
+    all_sides: Sequence[Side],
+    *,
+    method: str = "auto",
+    certify: bool = False,
+    exact_work: float = math.inf,
+    first_unstable: bool = False,
+) -> tuple[Analysis, Side]:
+    """Return the analysis of the worst side, and this side.
+
+    Floats analyze every side first. Exact arithmetic then decides what they leave undecided, from the side
+    with the largest spectral radius to the first unstable side.
+
+    Parameters
+    ----------
+    all_sides
+        The result of `one_sided_slopes.sides`, in any order.
+    method, certify
+        As for `analyze`.
+    exact_work
+        The largest number of states times events of a frame for which exact arithmetic decides what floats
+        leave undecided; beyond, the verdict stays undecided.
+    first_unstable
+        Whether the first side that floats find unstable is the result.
+    """
+    one_pass = certify or len(all_sides) == 1
+    analyses = []
+    for side in all_sides:
+        analyses.append(
+            _analyze(side, method=method, certify=certify, exact_work=exact_work if one_pass else 0)
+        )
+        if first_unstable and analyses[-1].verdict is StabilityVerdict.UNSTABLE:
+            return analyses[-1], side
+    if exact_work and not one_pass:
+        radii = [severity(None, analysis.spectral_radius) for analysis in analyses]
+        for n in sorted(range(len(analyses)), key=radii.__getitem__, reverse=True):
+            if not _is_decided(analyses[n]):
+                analyses[n] = _analyze(all_sides[n], method=method, certify=False, exact_work=exact_work)
+            if analyses[n].verdict is StabilityVerdict.UNSTABLE:
+                break
     verdicts = tuple(
-        SideVerdict(side.name, item.verdict, item.stable, item.spectral_radius, item.spectral_radius_error)
-        for side, item in zip(listed, each, strict=True)
+        SideVerdict(
+            side.name,
+            analysis.verdict,
+            analysis.stable,
+            analysis.spectral_radius,
+            analysis.spectral_radius_error,
+        )
+        for side, analysis in zip(all_sides, analyses, strict=True)
     )
     worst = worst_side(verdicts)
-    if len(listed) == 1:
-        return each[0], listed[0]
-    limitations = (*_of_sides([side.name for side in listed]), *each[worst].limitations)
-    return replace(each[worst], sides=verdicts, limitations=limitations), listed[worst]
+    if len(all_sides) == 1:
+        return analyses[0], all_sides[0]
+    limitations = (*_kink_limitation([side.name for side in all_sides]), *analyses[worst].limitations)
+    return replace(analyses[worst], sides=verdicts, limitations=limitations), all_sides[worst]
 
 
-def _analyze(system: Model, *, method: str, prepared: Prepared, certify: bool) -> Analysis:
-    """Return the analysis of a model without kinks."""
+def _is_decided(analysis: Analysis) -> bool:
+    """Return whether the verdict is decided, and the spectral radius known to WIDE."""
+    return analysis.stable is not None and analysis.spectral_radius_error <= WIDE * max(
+        analysis.spectral_radius, 1.0
+    )
+
+
+def _analyze(side: Side, *, method: str, certify: bool, exact_work: float) -> Analysis:
+    """Return the stability analysis of a side: a model that is differentiable at its start values.
+
+    The spectrum is computed by the method of the plan; the neutral modes then decide whether a model with
+    eigenvalues at 1 drifts or is stable up to common motions.
+
+    Parameters
+    ----------
+    side
+        The model at its parameter values.
+    method, certify, exact_work
+        As for `analyze_worst_side`.
+    """
+    numeric = side.numeric
+    system = numeric.model
     with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
-        topology = instance(system, prepared)
-        plan = make_plan(topology, method)
+        plan = make_plan(numeric, method)
         notes: tuple[Note, ...]
         if not plan.groups:
-            spectrum, notes = _solve_populations(topology)
+            spectrum, notes = _solve_populations(numeric)
         elif plan.method == "determinant":
             spectrum, notes = _solve_determinant(plan.loops), ()
-            small = all(loop.states <= MOST_STATES for loop in plan.loops)
+            matrices_fit = all(loop.states <= MATRIX_STATES for loop in plan.loops)
             if (
-                method == "auto" and spectrum.stable is None and small
+                method == "auto" and spectrum.stable is None and matrices_fit
             ):  # matrices bound an undecided determinant
-                decomposed = decompose(plan.groups, topology.exchange)
+                decomposed = decompose(plan.groups, numeric.exchange)
                 plan = replace(plan, method=decomposed.method, notes=decomposed.notes)
-                spectrum = _solve_closed(system, plan.loops, certify=certify)
+                spectrum = _solve_closed(system, plan.loops, certify=certify, exact_work=exact_work)
         else:
-            spectrum, notes = _solve_closed(system, plan.loops, certify=certify), ()
+            spectrum, notes = _solve_closed(system, plan.loops, certify=certify, exact_work=exact_work), ()
         if method == "determinant" and not np.isfinite(spectrum.spectral_radius_error):
-            raise cannot_serve(system, method, "what a frame's ticks round hides the peers' own eigenvalues")
+            raise cannot_serve(
+                system, method, "rounding within a frame exceeds the eigenvalues of single peers"
+            )
         if certify and (not plan.groups or plan.method == "determinant"):
             notes = (*notes, Limitation(LimitationCode.NO_BALLS, (plan.method,)))
-        nonlinear = not topology.affine
+        nonlinear = not numeric.affine
         elements = replaced_elements(system)
         linearized = nonlinear or bool(elements)
-        population = () if plan.loops else representatives(topology)
-        neutral_modes = _neutral_modes(spectrum, plan.loops, population)
+        first_peers = () if plan.loops else representatives(numeric)
+        neutral_modes = _neutral_modes(spectrum, plan.loops, first_peers)
         verdict, stable = spectrum.verdict, spectrum.stable
         if verdict in (StabilityVerdict.STABLE_TRANSLATING, StabilityVerdict.DRIFTS):
             verdict = (
@@ -278,15 +336,18 @@ def _analyze(system: Model, *, method: str, prepared: Prepared, certify: bool) -
             stable = verdict.stable
         proof = spectrum.proof
         if proof.outcome is ProofOutcome.DRIFTS and verdict is not StabilityVerdict.DRIFTS:
-            proof = replace(proof, outcome=ProofOutcome.STABLE)  # what drifts is a memory that nothing reads
-        of = ((ProofScope.LINEARIZATION, linearized), (ProofScope.NOMINAL_NETWORK, bool(unreliable(system))))
+            proof = replace(proof, outcome=ProofOutcome.STABLE)  # the drift is that of an unobservable memory
+        scopes = (
+            (ProofScope.LINEARIZATION, linearized),
+            (ProofScope.NOMINAL_NETWORK, bool(unreliable(system))),
+        )
         if proof:
-            proof = replace(proof, scope=tuple(scope for scope, is_so in of if is_so))
+            proof = replace(proof, scope=tuple(scope for scope, applies in scopes if applies))
     return Analysis(
         topology=system.name,
-        peers=topology.exchange.peers,
-        frame_s=float(topology.schedules[0].frame_s),
-        states_per_peer=max(map(states_of, topology.schedules, topology.subsystems)),
+        peers=numeric.exchange.peers,
+        frame_s=float(numeric.schedules[0].frame_s),
+        states_per_peer=max(map(states_of, numeric.schedules, numeric.subsystems)),
         method=plan.method,
         verdict=verdict,
         stable=stable,
@@ -297,7 +358,11 @@ def _analyze(system: Model, *, method: str, prepared: Prepared, certify: bool) -
         linearized=linearized,
         notes=(*plan.notes, *notes, *spectrum.notes),
         proof=proof,
-        limitations=(*elements, *(_near_start(plan.groups) if nonlinear else ()), *limitations(system)),
+        limitations=(
+            *elements,
+            *(_start_limitations(plan.groups) if nonlinear else ()),
+            *limitations(system),
+        ),
         unobservable=neutral_modes.names,
         translations=neutral_modes.translations,
         rotations=neutral_modes.rotations,
@@ -308,37 +373,40 @@ def _analyze(system: Model, *, method: str, prepared: Prepared, certify: bool) -
 def _neutral_modes(
     spectrum: Spectrum, loops: Sequence[ModalSystem], population: Sequence[PeerClass]
 ) -> NeutralModes:
-    """Return the neutral modes.
+    """Return the neutral modes of a model: translations, rotations, drifts, and unobservable memories.
 
     For a large population without loops, unobservable modes are those of single peers, and every other mode
     counts as a translation.
     """
     if not spectrum.rigid_modes or not any(
-        map(_remembers, (*population, *(g for loop in loops for g in loop.subsystems)))
+        map(_has_other_states, (*population, *(g for loop in loops for g in loop.subsystems)))
     ):
         return NeutralModes(spectrum.rigid_modes, 0, spectrum.drifts, 0, ())
-    listed: Sequence[tuple[ModalSystem, int]] = [(loop, loop.multiplicity) for loop in loops]
+    systems: Sequence[tuple[ModalSystem, int]] = [(loop, loop.multiplicity) for loop in loops]
     for group in population:
-        anyhow = {
+        generic_coupling = {
             coupling_term: ((Fraction(-1, 3),),) for coupling_term in used_coupling_terms([group.schedule])
         }
-        listed = [*listed, (ModalSystem(group.name, 1, (group,), anyhow), group.count)]
+        systems = [*systems, (ModalSystem(group.name, 1, (group,), generic_coupling), group.count)]
     with_drifts = bool(spectrum.drifts and loops)
-    pairs = [(classify_neutral_modes(loop, with_drifts=with_drifts), many) for loop, many in listed]
+    pairs = [
+        (classify_neutral_modes(loop, with_drifts=with_drifts), multiplicity)
+        for loop, multiplicity in systems
+    ]
     names = tuple(dict.fromkeys(name for neutral, _ in pairs for name in neutral.names))
-    unobservable = sum(neutral.unobservable * many for neutral, many in pairs)
+    unobservable = sum(neutral.unobservable * multiplicity for neutral, multiplicity in pairs)
     if not loops:
         return NeutralModes(spectrum.rigid_modes - unobservable, 0, spectrum.drifts, unobservable, names)
     return NeutralModes(
-        translations=sum(neutral.translations * many for neutral, many in pairs),
-        rotations=sum(neutral.rotations * many for neutral, many in pairs),
-        drifts=sum(neutral.drifts * many for neutral, many in pairs),
+        translations=sum(neutral.translations * multiplicity for neutral, multiplicity in pairs),
+        rotations=sum(neutral.rotations * multiplicity for neutral, multiplicity in pairs),
+        drifts=sum(neutral.drifts * multiplicity for neutral, multiplicity in pairs),
         unobservable=unobservable,
         names=names,
     )
 
 
-def _remembers(group: PeerClass) -> bool:
+def _has_other_states(group: PeerClass) -> bool:
     """Return whether peers have states other than lengths and their rates."""
     peer_type = group.jacobians.peer_type
     return any(clock.memories for clock in peer_type.clocks) or any(
@@ -346,7 +414,9 @@ def _remembers(group: PeerClass) -> bool:
     )
 
 
-def _solve_closed(system: Model, loops: Sequence[ModalSystem], *, certify: bool) -> Spectrum:
+def _solve_closed(
+    system: Model, loops: Sequence[ModalSystem], *, certify: bool, exact_work: float
+) -> Spectrum:
     """Return the spectrum of loops from their matrices."""
     closed = tuple(close_loop(loop) for loop in loops)
     if not all(
@@ -354,40 +424,39 @@ def _solve_closed(system: Model, loops: Sequence[ModalSystem], *, certify: bool)
         for closed_system in closed
     ):
         raise ApcError(Diagnostic("E806", SourceLocation(system.origin.topology), TOO_LARGE))
-    return solve_spectrum(closed, certify=certify)
+    return solve_spectrum(closed, certify=certify, exact_work=exact_work)
 
 
 def _solve_determinant(loops: Sequence[ModalSystem]) -> Spectrum:
     """Return the spectrum of loops from the zeros of their characteristic functions."""
     # Modules for large models are imported when needed: importing them costs 30 ms.
-    from apc.large_scale.determinant_spectrum import solve_loops
+    from apc.spectrum.determinant_spectrum import solve_loops
 
     return solve_loops(loops)
 
 
-def _solve_populations(topology: Instance) -> tuple[Spectrum, tuple[Note, ...]]:
-    """Return the spectrum of peers that all differ."""
-    from apc.large_scale.determinant_spectrum import solve_populations
-    from apc.large_scale.heterogeneous_peers import populations
-    from apc.large_scale.translation import count_translations
+def _solve_populations(numeric: NumericModel) -> tuple[Spectrum, tuple[Note, ...]]:
+    """Return the spectrum of a model whose peers all differ, and notes on undecided translations."""
+    from apc.spectrum.determinant_spectrum import solve_populations
+    from apc.spectrum.heterogeneous_peers import populations
+    from apc.spectrum.translation import count_translations
 
-    peers = populations(topology)
-    rigid = count_translations(topology, peers)
-    spectrum = solve_populations(peers, topology.exchange, rigid=rigid or 0)
-    free = "the first peer moves freely in a way that not all others do: left open"
-    return spectrum, () if rigid is not None else (free,)
+    peers = populations(numeric)
+    rigid = count_translations(numeric, peers)
+    spectrum = solve_populations(peers, numeric.exchange, rigid=rigid or 0)
+    note = "the first peer has a rigid mode that other peers lack; the rigid modes are undecided"
+    return spectrum, () if rigid is not None else (note,)
 
 
 def lifted_groups(
-    system: Model, *, prepared: Prepared | None = None
+    numeric: NumericModel,
 ) -> tuple[tuple[PeerClass, ...], CommunicationGraph]:
-    """Return the peers of a model in groups of equal dynamics, lifted, and the links between them.
+    """Return the classes of peers with equal dynamics, lifted over a frame, and the communication graph.
 
     Raises
     ------
     ApcError
         As `method_selection.refuse_varying` and `peer_classes.peer_groups`.
     """
-    topology = instance(system, prepared)
-    refuse_varying(system, topology.jacobians)
-    return peer_groups(topology), topology.exchange
+    refuse_varying(numeric.model, numeric.jacobians)
+    return peer_groups(numeric), numeric.exchange

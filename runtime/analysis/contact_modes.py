@@ -1,6 +1,6 @@
 """Contact modes: the analysis of a model with each combination of contacts on or off.
 
-Takes: a `Model` whose peers have switching parts (see `switches`).
+Takes: a `NumericModel` whose peers have switching parts (see `switches`).
 Gives: `ContactMode`, `ContactModes`, `contact_modes`; `parts_of_peer_types`, `settings`.
 Guarantees: in each mode every switching part is fully on or off, and the other parts are unchanged; where a
 piece is linear, the result holds globally.
@@ -22,11 +22,11 @@ from apc.analysis.switches import SwitchingPart, bind, switching_parts
 from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError
 from apc.compiler.timings import part
-from apc.frame.branch_conditions import SwitchedPeerType, find_switches
-from apc.frame.jacobians import SubsystemJacobians
-from apc.frame.linearize import linearize
-from apc.frame.numeric_model import Prepared, prepare
-from apc.frame.parameters import ResolvedNumbers, resolve
+from apc.lifting.numeric_model import NumericModel
+from apc.linearization.branch_conditions import SwitchedPeerType, find_switches
+from apc.linearization.jacobians import SubsystemJacobians
+from apc.linearization.linearize import linearize
+from apc.parameter_values.parameters import ResolvedNumbers, resolve
 from apc.result import Result
 from apc.verdict import StabilityVerdict
 
@@ -39,11 +39,11 @@ _Setting = tuple[frozenset[str], ...]
 
 @dataclass(frozen=True, slots=True)
 class ContactMode:
-    """One mode: `on` lists (group, its parts that are on).
+    """One contact mode: `on` lists for each group the names of its parts that are on.
 
-    The spectral radius is per frame; `frequency_hz` is that of its mode. `linearized` states that some piece
-    is not linear, so that the result holds near the start values only. Where a mode cannot be analysed,
-    `verdict` is "" and `refusal` is the reason.
+    The spectral radius is per frame; `frequency_hz` is that of the mode with the largest eigenvalue.
+    `linearized` states that some piece is not linear, so that the result holds near the start values only. If
+    a mode cannot be analysed, `verdict` is None and `refusal` is the reason.
     """
 
     name: str
@@ -60,7 +60,7 @@ class ContactMode:
 
 @dataclass(frozen=True, slots=True)
 class ContactModes(Result):
-    """Every contact mode of a model; empty where nothing switches.
+    """Every contact mode of a model; empty if no part switches.
 
     `parts` are the switching parts by name; `notes` are the limitations.
     """
@@ -79,7 +79,7 @@ class ContactModes(Result):
 
     @property
     def summary(self) -> str:
-        """The unstable modes, in one sentence; "" where nothing switches."""
+        """The verdict over all modes in one sentence, with the unstable modes; "" if no part switches."""
         if not self.modes:
             return ""
         unstable = self.unstable
@@ -96,58 +96,60 @@ class ContactModes(Result):
 
 
 @part("contact modes")
-def contact_modes(system: Model, *, prepared: Prepared | None = None) -> ContactModes:
-    """Analyse a model in each mode of its contacts, walls and limits.
+def contact_modes(
+    numeric: NumericModel,
+) -> ContactModes:
+    """Return the stability analysis of a model for each on/off combination of its contacts and limits.
 
     Parameters
     ----------
-    system
-        The compiled model, with the parameter values to analyse.
-    prepared
-        From `numeric_model.prepare`, of this model with these timings; avoids building the Jacobians again.
+    numeric
+        The model with its parameter values.
 
     Raises
     ------
     ApcError
-        E863 a part with too many decisions.
+        E863 a contact, wall or limit with too many conditions.
     """
-    prepared = prepared or prepare(system)
-    switched = [find_switches(subsystem.peer_type) for subsystem in prepared.jacobians]
-    hidden = dict.fromkeys(
+    system = numeric.model
+    switched = [find_switches(subsystem.peer_type) for subsystem in numeric.jacobians]
+    with_nonlinear_loop = dict.fromkeys(
         switched_peer_type.peer_type.name
         for switched_peer_type in switched
         if not switched_peer_type.walkable
     )
-    notes = tuple(f"not looked into: {name}, which has a nonlinear loop" for name in hidden)
+    notes = tuple(f"not analyzed: {name}, which has a nonlinear loop" for name in with_nonlinear_loop)
     with np.errstate(all="ignore"):
-        parts = parts_of_peer_types(system, switched, resolve(system))
-    names = tuple(dict.fromkeys(part.name for listed in parts for part in listed))
-    has = [frozenset(part.name for part in parts[group.peer_type]) for group in system.groups]
+        parts = parts_of_peer_types(system, switched, numeric.numbers)
+    names = tuple(dict.fromkeys(part.name for parts_of_type in parts for part in parts_of_type))
+    parts_of_groups = [frozenset(part.name for part in parts[group.peer_type]) for group in system.groups]
 
     def subsystem(peer_type: int, on: frozenset[str]) -> SubsystemJacobians:
-        """Return the Jacobians of a peer type with these parts on and all others off."""
+        """Return the Jacobians of a peer type with the parts named in `on` on, and all others off."""
         if not switched[peer_type].decisions:
-            return prepared.jacobians[peer_type]
+            return numeric.jacobians[peer_type]
         setting = settings((part for part in parts[peer_type] if part.name in on), on=True)
         setting |= settings((part for part in parts[peer_type] if part.name not in on), on=False)
-        return bind(switched[peer_type], prepared.jacobians[peer_type], setting)
+        return bind(switched[peer_type], numeric.jacobians[peer_type], setting)
 
     def mode(name: str, setting: _Setting) -> ContactMode:
-        """Return the analysis of the model with these parts on."""
+        """Return the analysis of the model with the parts of each group in `setting` on."""
         # Groups of one peer type with different parts on have two types now.
         numbers: dict[tuple[int, frozenset[str]], int] = {}
         groups = tuple(
-            replace(group, peer_type=numbers.setdefault((group.peer_type, local), len(numbers)))
-            for group, local in zip(system.groups, setting, strict=True)
+            replace(group, peer_type=numbers.setdefault((group.peer_type, parts_on), len(numbers)))
+            for group, parts_on in zip(system.groups, setting, strict=True)
         )
         subsystems = tuple(subsystem(*number) for number in numbers)
         peer_types = tuple(system.peer_types[peer_type] for peer_type, _ in numbers)
         changed = replace(system, peer_types=peer_types, groups=groups)
-        on = tuple((group.name, tuple(sorted(local))) for group, local in zip(groups, setting, strict=True))
-        analysis, refusal = None, _no_slope(changed, subsystems)
+        on = tuple(
+            (group.name, tuple(sorted(parts_on))) for group, parts_on in zip(groups, setting, strict=True)
+        )
+        analysis, refusal = None, _missing_slope_note(changed, subsystems)
         if not refusal:
             try:
-                analysis = analyze(changed, prepared=replace(prepared, jacobians=subsystems))
+                analysis = analyze(replace(numeric.with_jacobians(subsystems), model=changed))
             except ApcError as error:
                 refusal = error.mistakes[0].sentence
         if analysis is None:
@@ -166,7 +168,7 @@ def contact_modes(system: Model, *, prepared: Prepared | None = None) -> Contact
             radius_excess=analysis.radius_excess,
         )
 
-    modes = tuple(mode(name, setting) for setting, name in _settings(system, names, has).items())
+    modes = tuple(mode(name, setting) for setting, name in _settings(system, names, parts_of_groups).items())
     return ContactModes(system.name, names, modes, notes)
 
 
@@ -178,7 +180,7 @@ def parts_of_peer_types(
     Raises
     ------
     ApcError
-        E863 a part with too many decisions.
+        E863 a contact, wall or limit with too many conditions.
     """
     parts: list[tuple[SwitchingPart, ...]] = []
     for index, switched_peer_type in enumerate(switched):
@@ -188,7 +190,7 @@ def parts_of_peer_types(
 
 
 def settings(parts: Iterable[SwitchingPart], *, on: bool) -> dict[int, bool]:
-    """Return the settings of all decisions of some parts, each fully on or off."""
+    """Return the settings, by index of the decision, that switch some parts fully on or off."""
     return {
         index: value
         for part in parts
@@ -196,20 +198,24 @@ def settings(parts: Iterable[SwitchingPart], *, on: bool) -> dict[int, bool]:
     }
 
 
-def _settings(system: Model, names: Sequence[str], has: Sequence[frozenset[str]]) -> dict[_Setting, str]:
-    """Return the modes of a model with their names, each once; empty where nothing switches."""
-    nothing: frozenset[str] = frozenset()
-    result = {tuple(has): EVERYONE, tuple(nothing for _ in has): NOBODY} if names else {}
+def _settings(
+    system: Model, names: Sequence[str], parts_of_groups: Sequence[frozenset[str]]
+) -> dict[_Setting, str]:
+    """Return the name of each contact mode by its setting, each setting once; empty if no part switches."""
+    no_parts: frozenset[str] = frozenset()
+    result = (
+        {tuple(parts_of_groups): EVERYONE, tuple(no_parts for _ in parts_of_groups): NOBODY} if names else {}
+    )
     for index, group in enumerate(system.groups if names else ()):
-        alone = tuple(texts if g == index else nothing for g, texts in enumerate(has))
-        result.setdefault(alone, f"on at {group.name} alone")
+        single = tuple(part_names if g == index else no_parts for g, part_names in enumerate(parts_of_groups))
+        result.setdefault(single, f"on at {group.name} alone")
     for name in names:
-        result.setdefault(tuple(texts & {name} for texts in has), f"{name} on alone")
+        result.setdefault(tuple(part_names & {name} for part_names in parts_of_groups), f"{name} on alone")
     return result
 
 
-def _no_slope(system: Model, subsystems: Sequence[SubsystemJacobians]) -> str:
-    """Return a note on peers whose pieces have no slopes at the start values, "" if all have."""
+def _missing_slope_note(system: Model, subsystems: Sequence[SubsystemJacobians]) -> str:
+    """Return a note on a group whose piece has no slope at its start values, "" if all groups have slopes."""
     numbers = resolve(system)
     for group, rows in zip(system.groups, numbers.parameters, strict=True):
         subsystem = subsystems[group.peer_type]
@@ -218,5 +224,5 @@ def _no_slope(system: Model, subsystems: Sequence[SubsystemJacobians]) -> str:
         try:
             linearize(subsystem, rows[0])
         except ApcError:
-            return f"this piece of {group.name} is not linear and has no slope at the start values"
+            return f"this piece of {group.name} is not linear and has no slope at the initial values"
     return ""

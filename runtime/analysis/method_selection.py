@@ -1,6 +1,6 @@
 """The plan of an analysis: its method, and the systems to solve.
 
-Takes: an `Instance` of a model.
+Takes: a `NumericModel`.
 Gives: `AnalysisPlan`, `make_plan`; `refuse_varying`, `is_large_ring`, `not_populations`; `cannot_serve`.
 Guarantees: nothing is solved, and no matrix of a complete system is built.
 Does not: analyse (see `analysis`).
@@ -16,28 +16,22 @@ from apc.analysis.methods import METHODS, PAPER
 from apc.analysis.switches import varying_slopes
 from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
-from apc.eigen.graph_loops import common_graph
-from apc.eigen.interconnection import ModalSystem
-from apc.eigen.modes import decompose, dense_loop, refuse_dense
-from apc.eigen.peer_classes import (
-    MOST_STATES,
-    PeerClass,
-    more_differ,
-    peer_groups,
-    too_large,
-    used_coupling_terms,
-)
-from apc.frame.communication_graph import CommunicationGraph
-from apc.frame.jacobians import SubsystemJacobians
-from apc.frame.numeric_model import Instance
-from apc.frame.schedule import Schedule
-from apc.memory import refuse_beyond
+from apc.lifting.numeric_model import NumericModel
+from apc.linearization.jacobians import SubsystemJacobians
+from apc.spectrum.graph_loops import common_graph
+from apc.spectrum.interconnection import ModalSystem
+from apc.spectrum.modes import decompose, dense_loop, refuse_dense
+from apc.spectrum.peer_classes import PeerClass, has_more_states, peer_groups, too_large, used_coupling_terms
+from apc.support.memory import refuse_beyond
+from apc.support.state_limits import MATRIX_STATES
+from apc.timing.communication_graph import CommunicationGraph
+from apc.timing.schedule import Schedule
 
-# Up to this number of states of different peers, one matrix of all is faster than a method without it, and
+# Up to this number of states of different peers, one matrix of all peers is faster than a determinant, and
 # gives more results.
 FEW_STATES = 200
 
-# Equal peers on a ring are one system for each pair of its eigenvalues: more than these take minutes.
+# Equal peers on a ring form one system for each pair of the ring's eigenvalues: more systems take minutes.
 LARGEST_RING = 2000
 
 # From this number of packets in transit, a method without them in the state is faster.
@@ -57,9 +51,10 @@ CACHE_SIZE_OF_SUBSYSTEM, SUBSYSTEM_AT_WORK = 200, 6000
 
 @dataclass(frozen=True, slots=True)
 class AnalysisPlan:
-    """The method, and the groups of equal peers with their loops; neither for thousands of peers.
+    """The method of an analysis, with the classes of equal peers and their loops.
 
-    `systems` are (number, size): states, or rows of a determinant.
+    Classes and loops are empty for thousands of peers. `systems` are the (count, size) of the systems to
+    solve: states, or rows of a determinant.
     """
 
     method: str
@@ -70,7 +65,7 @@ class AnalysisPlan:
 
 
 def refuse_varying(system: Model, jacobians: Sequence[SubsystemJacobians]) -> None:
-    """Raise an error for equations whose slopes vary with time: frozen at an instant, they are another model.
+    """Raise an error if an equation's slopes vary with time: frozen at one instant they are another model.
 
     Parameters
     ----------
@@ -82,102 +77,112 @@ def refuse_varying(system: Model, jacobians: Sequence[SubsystemJacobians]) -> No
     Raises
     ------
     ApcError
-        E810 such an equation.
+        E810 an equation whose slopes vary with time.
     """
     for subsystem in jacobians:
         if names := varying_slopes(subsystem):
-            message = f"the equation of {names[0]} multiplies what moves by what changes with time"
-            why = "no one frame stands for all others, so that no verdict can be had; a simulation plays it"
+            message = f"the equation of {names[0]} multiplies a state by a function of time"
+            why = "frames differ, so there is no verdict; use a simulation"
             location = SourceLocation(system.origin.topology)
-            raise ApcError(Diagnostic("E810", location, f"{message}: {why}", hint="apc simulate"))
+            raise ApcError(Diagnostic("E810", location, f"{message}: {why}", fix="apc simulate"))
 
 
-def make_plan(instance: Instance, method: str = "auto") -> AnalysisPlan:
-    """Return the plan with the method that suits a model, or with the requested one if it is applicable.
+def make_plan(numeric: NumericModel, method: str = "auto") -> AnalysisPlan:
+    """Return the plan with the fastest applicable method, or with the method that the caller names.
 
     Parameters
     ----------
-    instance
+    numeric
         The model with its parameter values.
     method
-        One of `methods.METHODS`, not the paper's.
+        One of `methods.METHODS` except the paper's; "auto" selects the fastest.
 
     Raises
     ------
     ApcError
-        E804 a system of too many states for its matrix, E850 a method that is not applicable; and those of
-        `refuse_varying` and `peer_classes.peer_groups`.
+        E804 a system of too many states for its matrix, E850 a method that is not applicable; and the errors
+        of `refuse_varying` and `peer_classes.peer_groups`.
     """
-    system, exchange = instance.system, instance.exchange
+    system, exchange = numeric.model, numeric.exchange
     if method not in METHODS or method == PAPER:
-        raise cannot_serve(system, method, f"the methods are {', '.join(METHODS)}")
-    refuse_varying(system, instance.jacobians)
-    can = method in ("auto", "determinant") and not not_populations(system, instance.jacobians)
-    if can and ((method == "determinant" and _prompt(instance)) or more_differ(instance, FEW_STATES)):
-        coupling_terms = used_coupling_terms(instance.schedules)
+        raise cannot_serve(system, method, f"available methods: {', '.join(METHODS)}")
+    refuse_varying(system, numeric.jacobians)
+    populations_allowed = method in ("auto", "determinant") and not not_populations(system, numeric.jacobians)
+    if populations_allowed and (
+        (method == "determinant" and _is_short_and_complete(numeric)) or has_more_states(numeric, FEW_STATES)
+    ):
+        coupling_terms = used_coupling_terms(numeric.schedules)
         sparse = [
             coupling_term.link
             for coupling_term in coupling_terms
             if not exchange.is_complete(coupling_term.link)
         ]
         if not sparse:
-            return _plan_populations(instance)
+            return _plan_populations(numeric)
         if method == "determinant":
-            reason = f"the peers differ, and not all of them hear all others over {sparse[0]}"
+            reason = f"the peers differ and are not completely connected over {sparse[0]}"
             raise cannot_serve(system, method, reason)
-    groups = peer_groups(instance)
+    groups = peer_groups(numeric)
     if is_large_ring(groups, exchange):
-        message = f"a ring of {exchange.peers:,} peers is as many systems, up to {LARGEST_RING:,} are solved"
+        message = f"a ring of {exchange.peers:,} peers has as many subsystems; the limit is {LARGEST_RING:,}"
         raise ApcError(
-            Diagnostic("E804", SourceLocation(exchange.topology), message, hint=f"count: {LARGEST_RING}")
+            Diagnostic("E804", SourceLocation(exchange.topology), message, fix=f"count: {LARGEST_RING}")
         )
     if method == "dense":
         refuse_dense(groups, exchange)
         loops: tuple[ModalSystem, ...] = (dense_loop(groups, exchange),)
-        text, notes = "dense", tuple[str, ...]()
+        chosen_method, notes = "dense", tuple[str, ...]()
     else:
         decomposed = decompose(groups, exchange)
         if method == "modes" and decomposed.method != "modes":
             raise cannot_serve(system, method, decomposed.notes[0])
-        loops, text, notes = decomposed.loops, decomposed.method, decomposed.notes
+        loops, chosen_method, notes = decomposed.loops, decomposed.method, decomposed.notes
         packets = max(sum(sum(group.schedule.depths) for group in loop.subsystems) for loop in loops)
-        held = max(sum(len(group.schedule.discrete_states) for group in loop.subsystems) for loop in loops)
+        stored_outputs = max(
+            sum(len(group.schedule.discrete_states) for group in loop.subsystems) for loop in loops
+        )
         if method == "determinant":
-            text = method
+            chosen_method = method
         elif method == "auto" and (
             any(_long_lines(group.schedule) for loop in loops for group in loop.subsystems)
-            or (packets + held > LONG_LINES and max(loop.states for loop in loops) > MOST_STATES)
+            or (packets + stored_outputs > LONG_LINES and max(loop.states for loop in loops) > MATRIX_STATES)
         ):
-            text = "determinant"
-            in_flight = f"{packets:,} packets are on their way at a time, none of which is made a state"
-            notes = (*notes, in_flight if packets > LONG_LINES else "one matrix of all is too large")
-    if text != "determinant":
+            chosen_method = "determinant"
+            in_flight = f"{packets:,} packets in transit are not states"
+            notes = (*notes, in_flight if packets > LONG_LINES else "a single matrix is too large")
+    if chosen_method != "determinant":
         for loop in loops:
-            if loop.states > MOST_STATES:
+            if loop.states > MATRIX_STATES:
                 raise too_large(exchange, f"{exchange.peers:,} peers", loop.states, auto=method == "auto")
-        needed = (
+        needed_bytes = (
             CACHE_SIZE * sum(loop.states**2 for loop in loops)
             + AT_WORK * max(loop.states for loop in loops) ** 2
         )
         message = f"{len(loops):,} systems of up to {max(loop.states for loop in loops):,} states"
     else:
-        needed = sum(_determinant_bytes(loop) for loop in loops)
+        needed_bytes = sum(_determinant_memory(loop) for loop in loops)
         subsystems = sum(len(loop.subsystems) for loop in loops)
-        message = f"{len(loops):,} determinants of {subsystems:,} peers that differ"
+        message = f"{len(loops):,} determinants of {subsystems:,} different peers"
     refuse_beyond(
-        needed, "E804", SourceLocation(exchange.topology), message, "fewer peers that differ, or fewer states"
+        needed_bytes,
+        "E804",
+        SourceLocation(exchange.topology),
+        message,
+        "reduce the number of different peers or of states",
     )
-    return AnalysisPlan(text, groups, loops, _sizes(loops, text), notes)
+    return AnalysisPlan(chosen_method, groups, loops, _sizes(loops, chosen_method), notes)
 
 
 def _long_lines(schedule: Schedule) -> bool:
-    """Return whether many packets are in transit at a time, each for many frames."""
+    """Return whether many packets are in transit: above LONG_LINES, and above MANY_FRAMES frames of sent
+    packets.
+    """
     packets = sum(schedule.depths)
     return packets > max(LONG_LINES, MANY_FRAMES * len(schedule.sent))
 
 
 def is_large_ring(groups: Sequence[PeerClass], exchange: CommunicationGraph) -> bool:
-    """Return whether all peers are equal, on one ring with too many eigenvalues for a system each."""
+    """Return whether all peers are equal and form one ring of more than LARGEST_RING peers."""
     coupling_terms = used_coupling_terms(group.schedule for group in groups)
     shapes = {exchange.links[coupling_term.link].graph.shape for coupling_term in coupling_terms}
     if len(groups) > 1 or shapes != {"ring"} or exchange.peers <= LARGEST_RING:
@@ -186,13 +191,13 @@ def is_large_ring(groups: Sequence[PeerClass], exchange: CommunicationGraph) -> 
 
 
 def cannot_serve(system: Model, method: str, reason: str) -> ApcError:
-    """Return the error for a method that is not applicable."""
-    message = f"method {method} can't serve this topology: {reason}"
-    return ApcError(Diagnostic("E850", SourceLocation(system.origin.topology), message, hint="--method auto"))
+    """Return the error E850 for a method that is not applicable, with its reason."""
+    message = f"method {method} does not apply to this topology: {reason}"
+    return ApcError(Diagnostic("E850", SourceLocation(system.origin.topology), message, fix="--method auto"))
 
 
 def _sizes(loops: Sequence[ModalSystem], method: str) -> tuple[tuple[int, int], ...]:
-    """Return the number of loops of each size."""
+    """Return (count, size) of the loops: the size is in states, or in rows of the determinant."""
     sizes = Counter(
         sum(len(group.schedule.sent) for group in loop.subsystems) if method == "determinant" else loop.states
         for loop in loops
@@ -200,8 +205,10 @@ def _sizes(loops: Sequence[ModalSystem], method: str) -> tuple[tuple[int, int], 
     return tuple((count, size) for size, count in sizes.items())
 
 
-def _determinant_bytes(loop: ModalSystem) -> int:
-    """Return the memory of a loop's subsystems, each identified by its sent and received values."""
+def _determinant_memory(loop: ModalSystem) -> int:
+    """Return the memory in bytes of a loop's determinant, given by its numbers of sent and received
+    values.
+    """
     entries = sum(len(subsystem.schedule.sent) for subsystem in loop.subsystems) * sum(
         len(subsystem.schedule.received) for subsystem in loop.subsystems
     )
@@ -209,31 +216,31 @@ def _determinant_bytes(loop: ModalSystem) -> int:
 
 
 def not_populations(system: Model, jacobians: Sequence[SubsystemJacobians]) -> str:
-    """Return why the method for thousands of peers is not applicable, "" if it is."""
+    """Return the reason why the method for thousands of peers is not applicable, "" if it is applicable."""
     for peer_type, subsystem in zip(system.peer_types, jacobians, strict=True):
         if subsystem.edges:
-            return f"{peer_type.name} looks at each sender by itself"
+            return f"{peer_type.name} depends on individual senders"
         if not subsystem.affine:
-            return f"{peer_type.name} is not linear, so that each peer is linearized where it starts"
+            return f"{peer_type.name} is not linear, so each peer is linearized at its own initial state"
     return ""
 
 
-def _prompt(instance: Instance) -> bool:
-    """Return whether peers differ, all graphs are complete, and few packets are in transit."""
-    schedules = instance.schedules
+def _is_short_and_complete(numeric: NumericModel) -> bool:
+    """Return whether peers differ, all graphs are complete, and at most LONG_LINES packets are in transit."""
+    schedules = numeric.schedules
     complete = all(
-        instance.exchange.is_complete(coupling_term.link) for coupling_term in used_coupling_terms(schedules)
+        numeric.exchange.is_complete(coupling_term.link) for coupling_term in used_coupling_terms(schedules)
     )
     short = max(sum(schedule.depths) for schedule in schedules) <= LONG_LINES
-    return complete and short and sum(map(len, instance.numbers.parameters)) > 1
+    return complete and short and sum(map(len, numeric.numbers.parameters)) > 1
 
 
-def _plan_populations(instance: Instance) -> AnalysisPlan:
-    """Return the plan for thousands of peers on complete graphs."""
+def _plan_populations(numeric: NumericModel) -> AnalysisPlan:
+    """Return the plan for thousands of peers on complete graphs: one determinant of all sent values."""
     rows = {
-        (instance.exchange.delay_class(index), sent)
-        for index, schedule in enumerate(instance.schedules)
+        (numeric.exchange.delay_class(index), sent)
+        for index, schedule in enumerate(numeric.schedules)
         for sent in schedule.sent
     }
-    note = "peers of different numbers, by one determinant of what is sent in a frame"
+    note = "different peers: one determinant of the packets sent in a frame"
     return AnalysisPlan("determinant", (), (), ((1, len(rows)),), (note,))

@@ -16,16 +16,18 @@ import numpy as np
 from apc.analysis.method_selection import make_plan
 from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError
-from apc.frame.data_age import linear_subsystems, of_single_delay
-from apc.frame.evaluation_errors import finite_equations
-from apc.frame.jacobians import edge_name
-from apc.frame.numeric_model import instance, prepare
+from apc.lifting.data_age import linear_subsystems, of_single_delay
+from apc.lifting.numeric_model import NumericModel, numeric_model
+from apc.linearization.evaluation_errors import finite_equations
+from apc.linearization.jacobians import edge_name
 from apc.result import Result
 
 
 @dataclass(frozen=True, slots=True)
 class SubsystemSize:
-    """The values that one peer of a type stores from frame to frame."""
+    """The number of states of one peer of a type, by kind: continuous states, stored outputs, packets in
+    transit.
+    """
 
     name: str
     motion: int
@@ -34,7 +36,7 @@ class SubsystemSize:
 
     @property
     def states(self) -> int:
-        """The sum of all counts."""
+        """The number of states of one peer: the sum of the three counts."""
         return self.motion + self.stored + self.packets
 
 
@@ -42,8 +44,8 @@ class SubsystemSize:
 class ModelSize(Result):
     """The size of a model: `subsystems` one per peer type, `ticks` of each clock in a frame.
 
-    It is analysed by `method` as `systems`, (count, size); `refused` is the reason if there are none. `pairs`
-    names the receives that are evaluated once for each pair of peers.
+    `systems` are the (count, size) of the systems that `method` solves; `refused` is the reason if the model
+    cannot be analysed. `pairs` names the receives that are evaluated once for each pair of peers.
     """
 
     shown_by = "analysis_output:model_size"
@@ -59,21 +61,25 @@ class ModelSize(Result):
 
 
 def model_size(system: Model) -> ModelSize:
-    """Return the size of a model from frame to frame."""
+    """Return the numbers of states, ticks and packets in a frame of a model."""
     with finite_equations(system.origin.topology):
-        return _subsystem_size(system)
+        return _model_size(system)
 
 
-def _subsystem_size(system: Model) -> ModelSize:
+def _model_size(system: Model) -> ModelSize:
+    """Return the size of a model; `refused` contains the reason if the model cannot be analysed.
+
+    Peer types with ages of several delays are counted with the data of a single delay.
+    """
     refused = ""
     try:
-        prepared = prepare(system)
+        numeric = numeric_model(system)
     except ApcError as error:  # ages of several delays; a simulation needs no single age
         refused = error.mistakes[0].sentence
-        prepared = prepare(system, linear_subsystems(of_single_delay(system)))
+        numeric = NumericModel(system, linear_subsystems(of_single_delay(system)))
     schedule_of = {
         group.peer_type: schedule
-        for group, schedule in reversed(list(zip(system.groups, prepared.schedules, strict=True)))
+        for group, schedule in reversed(list(zip(system.groups, numeric.schedules, strict=True)))
     }
     subsystems = tuple(
         SubsystemSize(
@@ -88,17 +94,17 @@ def _subsystem_size(system: Model) -> ModelSize:
     systems: tuple[tuple[int, int], ...] = ()
     try:
         with np.errstate(over="ignore", invalid="ignore"):  # the sizes count here, not the values
-            plan = None if refused else make_plan(instance(system, prepared))
+            plan = None if refused else make_plan(numeric)
         if plan is not None:
             method, systems = plan.method, plan.systems
     except ApcError as error:  # a model that cannot be analysed may still be simulated
         refused = error.mistakes[0].sentence
-    frame = prepared.schedules[0].frame_s
+    frame = numeric.schedules[0].frame_s
     return ModelSize(
         system.peers,
         frame,
         subsystems,
-        tuple((clock.name, int(frame / prepared.timings[clock.period])) for clock in system.clocks),
+        tuple((clock.name, int(frame / numeric.timings[clock.period])) for clock in system.clocks),
         method,
         systems,
         refused,

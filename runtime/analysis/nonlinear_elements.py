@@ -15,18 +15,18 @@ from collections.abc import Iterator
 import casadi
 
 from apc.compiler.compiled import Model, PeerType
-from apc.frame.branch_conditions import functions_of
-from apc.frame.jacobians import nodes_of
-from apc.frame.numeric_model import Prepared
+from apc.lifting.numeric_model import NumericModel
+from apc.linearization.branch_conditions import functions_of
+from apc.linearization.jacobians import nodes_of
 
 # Operations whose slope is zero wherever they have one.
 FLAT = {casadi.OP_FLOOR, casadi.OP_CEIL, casadi.OP_SIGN}
 
-OF_ALL = "apc simulate covers smaller motions"
+OF_ALL = "use apc simulate for smaller motions"
 
 
 def replaced_elements(system: Model) -> tuple[str, ...]:
-    """Return a line for each element that is replaced, or flat, in a linear analysis.
+    """Return one sentence for each element that a linear analysis replaces, or whose slope is zero there.
 
     Parameters
     ----------
@@ -44,21 +44,24 @@ def replaced_elements(system: Model) -> tuple[str, ...]:
     return tuple(dict.fromkeys(lines))
 
 
-def is_linear(system: Model, prepared: Prepared) -> bool:
+def is_linear(numeric: NumericModel) -> bool:
     """Return whether the equations are linear as written, with no element replaced.
 
     Parameters
     ----------
-    system, prepared
-        The compiled model, and the result of `numeric_model.prepare`.
+    numeric
+        The model with its parameter values.
     """
     return all(
-        prepared.jacobians[group.peer_type].affine and not system.peer_types[group.peer_type].replaced
-        for group in system.groups
+        numeric.jacobians[group.peer_type].affine and not numeric.model.peer_types[group.peer_type].replaced
+        for group in numeric.model.groups
     )
 
 
 def _replaced(peer_type: PeerType) -> Iterator[str]:
+    """Yield one sentence for each element of a peer type that other equations replace in a linear
+    analysis.
+    """
     for element in peer_type.replaced:
         valid = f", valid for {element.valid}" if element.valid else ""
         yield f"{element.part} is replaced by {'; '.join(element.equations)}{valid}: {OF_ALL}"
@@ -66,19 +69,20 @@ def _replaced(peer_type: PeerType) -> Iterator[str]:
 
 @functools.lru_cache(maxsize=64)
 def _flat(peer_type: PeerType) -> tuple[str, ...]:
-    """Return a line for each equation with a floor, ceil or sign of a motion: its slope is zero."""
+    """Return one sentence for each equation with a floor, ceil or sign of a state: its slope is zero."""
     result: dict[str, None] = {}
     for _, function, arguments, rows in functions_of(peer_type):
         if not function.is_a("SXFunction"):
             continue
         symbols = function.sx_in()
-        column = function(*symbols)
-        moving = casadi.vertcat(
+        outputs = function(*symbols)
+        variables = casadi.vertcat(
             *(symbol for name, symbol in zip(arguments, symbols, strict=True) if name not in ("p", "t"))
         )
-        for row in range(column.numel()):
+        for row in range(outputs.numel()):
             if any(
-                node.op() in FLAT and casadi.depends_on(node.dep(0), moving) for node in nodes_of(column[row])
+                node.op() in FLAT and casadi.depends_on(node.dep(0), variables)
+                for node in nodes_of(outputs[row])
             ):
                 name = rows[row % len(rows)]
                 result[f"{name} is constant between jumps: its slope is zero in a linear analysis"] = None

@@ -19,6 +19,7 @@ from bokeh.models import (
     Div,
     FixedTicker,
     HoverTool,
+    LogTicker,
     Range1d,
     Slider,
     Toggle,
@@ -28,31 +29,32 @@ from bokeh.plotting import figure
 from apc.app.motion import MM, ROWS, AnimationFrames
 from apc.compiler.wording import counted
 from apc.output.formatting import Plain, axis_label
+from apc.output.still_picture import THICKNESS
 
-# Colors distinct in print and for color-blind readers: Okabe and Ito, 2008; the lightest two are darkened to
-# the contrast of WCAG 2.1, 1.4.11, against white.
+# Colors that are distinct in print and for color-blind readers: Okabe and Ito, 2008; the lightest two are
+# darkened to the contrast of WCAG 2.1, 1.4.11, on white.
 BLUE, ORANGE, GREY, INK = "#0072B2", "#D55E00", "#595959", "#1a1a1a"
 COLOURS = (BLUE, ORANGE, "#009E73", "#CC79A7", "#000000", "#6A86E8", "#A87300", "#7F3C8D")
 DASHES, DASH_WORDS = (
     ("solid", "dashed", "dotted", "dotdash"),
-    ("drawn through", "dashed", "dotted", "dash and dot"),
+    ("solid", "dashed", "dotted", "dash-dotted"),
 )
 HEIGHT = 330
-# Margins around the unit circle and eigenvalues outside it; around bodies, as a share of their motion.
+# Relative margins around the unit circle, around eigenvalues outside it, and around the motion of bodies.
 ROUND, BEYOND, ROOM = 1.12, 1.05, 0.1
 CIRCLE = np.exp(1j * np.linspace(0, 2 * np.pi, 241))
 
-# The vertical distance of a peer's bodies on a line, as a share of that between two peers.
+# The vertical distance of the bodies of a peer, relative to the distance between two peers.
 STAGGER = 0.3
-# Height of a line of names, in pixels.
+# Height of a line of names, and length of an orientation bar, in pixels.
 LINE, BAR = 13, 48
-# Seconds that a whole motion is played in.
+# Duration of the animation of a motion, in seconds.
 SECONDS = 10
 INSTANT = """
 const time = frames.data.time
 return time.length ? time[Math.min(Math.round(tick), time.length - 1)].toFixed(3) + ' s' : ''
 """
-# Changed in place: what is shown at an instant is this tab's, and not sent anywhere.
+# The data are changed in place: the displayed instant belongs to this tab, and is not sent to the server.
 SHOWING = """
 const {time, x, y, angle} = frames.data // by time, then by body, one row behind the other
 if (time.length) {
@@ -63,6 +65,16 @@ if (time.length) {
     bodies.data.y[body] = y[k * count + body]
     bodies.data.angle[body] = angle[k * count + body]
   }
+  const c = contacts.data // from a body to the grasp point of another
+  for (let i = 0; i < c.holder.length; i++) {
+    const [a, b] = [c.holder[i], c.held[i]]
+    const [cos, sin] = [Math.cos(bodies.data.angle[b]), Math.sin(bodies.data.angle[b])]
+    c.x0[i] = bodies.data.x[a]
+    c.y0[i] = bodies.data.y[a]
+    c.x1[i] = bodies.data.x[b] + cos * c.arm_x[i] - sin * c.arm_y[i]
+    c.y1[i] = bodies.data.y[b] + sin * c.arm_x[i] + cos * c.arm_y[i]
+  }
+  contacts.change.emit()
   instant.data.x[0] = time[k]
   bodies.change.emit()
   instant.change.emit()
@@ -83,7 +95,7 @@ FOCUS = """
     :host { font: 13px/1.4 system-ui, sans-serif; color: #1a1a1a; }
     .noUi-handle:focus-visible, button:focus-visible, select:focus-visible
       { outline: 3px solid #0072B2; outline-offset: 1px; }
-    .bk-btn { padding: 6px 2px; } /* three of them stand side by side in a narrow window */
+    .bk-btn { padding: 6px 2px; } /* three of them fit into a narrow window */
     .noUi-target { border-color: #767676; margin: 0 8px; }
     .noUi-handle { border-color: #595959; }
     """
@@ -99,7 +111,7 @@ STYLE = """
 
 
 def _plot(name: str, **settings: Any) -> Any:
-    """Return a figure as all are: as wide as its place, with few tools."""
+    """Return an empty figure with the common settings of all figures."""
     plot = figure(
         name=f"{name}-plot",
         height=HEIGHT,
@@ -115,8 +127,8 @@ def _plot(name: str, **settings: Any) -> Any:
     return plot
 
 
-def _legend_below(plot: Any) -> None:
-    """Put the legend where it covers nothing."""
+def _move_legend_out(plot: Any) -> None:
+    """Move the legend outside of the plotting area."""
     legend = plot.legend[0]
     legend.update(orientation="horizontal", border_line_color=None, padding=0, label_text_color=INK)
     plot.center.remove(legend)
@@ -124,22 +136,23 @@ def _legend_below(plot: Any) -> None:
 
 
 class LiveText:
-    """A text of the page, which is read aloud when it changes."""
+    """A text of the page that screen readers read aloud when it changes."""
 
     def __init__(self, name: str) -> None:
+        """Create the text with its name in the page."""
         self.model = Div(
             text="<p>Computing …</p>", name=name, stylesheets=[STYLE], sizing_mode="stretch_width"
         )
 
     def show_text(self, *lines: str) -> None:
-        """Show lines, as they are."""
+        """Show lines of plain text."""
         self.model.text = "".join(f"<p>{escape(line)}</p>" for line in lines)
 
     def verdict(self, result: Plain) -> None:
-        """Show a verdict, what limits it, and behind a lid all that `apc analyze` prints."""
+        """Show a verdict, the dominant mode, limitations and, collapsed, the output of `apc analyze`."""
         kind = {True: "stable", False: "unstable"}.get(result["stable"], "")
         self.model.text = (
-            f"<p><strong class='{kind}'>{escape(result['verdict'])}</strong>, spectral radius "
+            f"<p><strong class='{kind}'>{escape(result['verdict'])}</strong>, {result['measure']} "
             f"{result['radius']:.9g} per frame</p><p>{escape(result['limits'])}</p>"
             + "".join(f"<p>{escape(item)}</p>" for item in result["notes"])
             + "<details><summary>All modes</summary>"
@@ -156,7 +169,7 @@ class LiveText:
 
 
 class RegionFigure:
-    """The stable region of two parameters, and where in it the model is."""
+    """The stable region of two parameters, with a mark at the present values."""
 
     def __init__(self) -> None:
         self.plot = _plot("region", x_range=Range1d(0, 1), y_range=Range1d(0, 1))
@@ -187,9 +200,10 @@ class RegionFigure:
             line_color="#000000",
             fill_color="#ffffff",
             line_width=2,
-            legend_label="the sliders",
+            legend_label="present values",
         )
-        _legend_below(self.plot)
+        _move_legend_out(self.plot)
+        self.plot.visible = False
         self.words = LiveText("region-words")
 
     def show(self, result: Plain) -> None:
@@ -213,26 +227,28 @@ class RegionFigure:
             axis.axis_label = axis_label(label, unit)
             span.update(start=low, end=high)
         steps = (
-            ("Between the edges of its cells the boundary is drawn straight.",) if result["stepped"] else ()
+            ("The boundary is interpolated linearly between the edges of its cells.",)
+            if result["stepped"]
+            else ()
         )
         self.words.show_text(
-            f"Stable in {100 * result['share']:.3g} % of what is shown.", *steps, *result["notes"]
+            f"Stable in {100 * result['share']:.3g} % of the rectangle.", *steps, *result["notes"]
         )
 
     def clear(self, why: str) -> None:
-        """Show no region, and why."""
+        """Hide the region, and show the reason."""
         self.plot.visible = False
         self.inside.data = self.boundary.data = {"xs": [], "ys": []}
         self.words.nothing(why)
 
     def mark(self, x: float, y: float) -> None:
-        """Mark where the model is."""
+        """Mark the present values of the parameters."""
         if self.point.data != (data := {"x": [x], "y": [y]}):
             self.point.data = data
 
 
 class RootsFigure:
-    """Eigenvalues over the unit circle, and their paths as a slider moves."""
+    """Eigenvalues and the unit circle, with the root locus over the range of a slider."""
 
     def __init__(self) -> None:
         self.plot = _plot(
@@ -247,7 +263,7 @@ class RootsFigure:
         self.path = ColumnDataSource({"x": [], "y": [], "name": []})
         self.plot.line(CIRCLE.real, CIRCLE.imag, line_color=GREY, line_width=1.5)
         self.plot.scatter(
-            "x", "y", source=self.path, size=3, fill_color=BLUE, line_color=None, legend_label="as it moves"
+            "x", "y", source=self.path, size=3, fill_color=BLUE, line_color=None, legend_label="root locus"
         )
         self.plot.scatter(
             "x",
@@ -257,16 +273,18 @@ class RootsFigure:
             marker="x",
             line_color=ORANGE,
             line_width=2,
-            legend_label="now",
+            legend_label="present values",
         )
-        # As wide as high: a circle is one.
+        # Equal width and height, so that the circle is round.
         self.plot.update(sizing_mode="fixed", width=HEIGHT + 30, height=HEIGHT + 30)
-        _legend_below(self.plot)
-        self.words, self.path_text = LiveText("roots-words"), LiveText("way-words")
-        self.path_text.show_text("Move a slider: dots show the way the eigenvalues take.")
+        _move_legend_out(self.plot)
+        self.plot.visible = False
+        self.words, self.path_text = LiveText("roots-words"), LiveText("locus-words")
+        self.path_text.show_text("Move a slider to draw the root locus over its range.")
 
     def show(self, result: Plain) -> None:
         """Draw the eigenvalues of an analysis."""
+        self.plot.visible = True
         self.now.data = {"x": result["real"], "y": result["imag"], "name": result["names"]}
         size = BEYOND * float(np.hypot(result["real"], result["imag"]).max(initial=0.0))
         reach = max(ROUND, size)
@@ -281,12 +299,12 @@ class RootsFigure:
         """Draw the root locus: the eigenvalues over the range of a slider."""
         self.path.data = {"x": result["real"], "y": result["imag"], "name": result["name"]}
         self.path_text.show_text(
-            f"Dots: where they are for {result['slider']} from {result['from']} to {result['to']}."
+            f"Dots: root locus for {result['slider']} from {result['from']} to {result['to']}."
         )
 
 
 class MotionFigure:
-    """The response over time, and the bodies that move: played, stopped, or taken to any time."""
+    """The response over time, and an animation of the moving bodies."""
 
     def __init__(self) -> None:
         self.lines = ColumnDataSource(columns("xs", "ys", "colour", "dash", "name"))
@@ -295,6 +313,7 @@ class MotionFigure:
         self.bodies = ColumnDataSource(
             columns("x", "y", "angle", "width", "height", "bar", "name", "above", "colour")
         )
+        self.contacts = ColumnDataSource(columns("x0", "y0", "x1", "y1", "holder", "held", "arm_x", "arm_y"))
         self.walls = ColumnDataSource(columns("x", "top", "bottom"))
         self.discs = ColumnDataSource(columns("x", "y", "radius"))
         self.plot = _plot(
@@ -322,13 +341,15 @@ class MotionFigure:
             "y",
             "width",
             "height",
+            angle="angle",
             source=self.bodies,
             fill_color="colour",
             fill_alpha=0.3,
             line_color="#000000",
         )
         bar = {"marker": "dash", "size": "bar", "angle": "angle", "line_color": "colour", "line_width": 3}
-        self.stage.scatter("x", "y", source=self.bodies, **bar)  # along the axis of what turns
+        self.stage.scatter("x", "y", source=self.bodies, **bar)  # the orientation of rotating bodies
+        self.stage.segment("x0", "y0", "x1", "y1", source=self.contacts, line_color=INK, line_width=1.5)
         self.stage.scatter("x", "y", source=self.bodies, size=9, fill_color="colour", line_color="#000000")
         self.stage.text(
             "x",
@@ -358,6 +379,7 @@ class MotionFigure:
                 "slider": self.time,
                 "frames": self.frames,
                 "bodies": self.bodies,
+                "contacts": self.contacts,
                 "instant": self.instant,
             },
             code=SHOWING,
@@ -368,10 +390,11 @@ class MotionFigure:
         self.simulation.js_on_change(
             "active", CustomJS(args={"slider": self.time, "frames": self.frames}, code=PLAYING)
         )
+        self._visible(False)
         self.words = LiveText("motion-words")
 
     def show(self, motion: AnimationFrames) -> None:
-        """Draw a motion, and put the bodies where they are at the time that is shown."""
+        """Draw a motion, and the bodies at the displayed time."""
         self._visible(True)
         peers, names = (
             list(dict.fromkeys(item))
@@ -392,19 +415,25 @@ class MotionFigure:
             rows = [peers.index(peer) + STAGGER * names.index(body.name) for peer, body in motion.bodies]
             y = np.tile(rows, (len(x), 1))
         sizes = [MM * body.radius for _, body in motion.bodies]
+        boxes = {held: np.abs(arm) for _, held, arm in motion.contacts if motion.bodies[held][1].turning}
+        boxes = {held: np.maximum(arm, THICKNESS * arm.max()) for held, arm in boxes.items() if arm.any()}
+        half = [boxes.get(index, (size, size)) for index, size in enumerate(sizes)]
         self.bodies.data = {
             "x": x[0],
             "y": y[0],
             "angle": motion.angle[0],
-            "bar": [BAR if body.turning else 0 for _, body in motion.bodies],
-            "width": [2 * size for size in sizes],
-            "height": [2 * size if planar else 0.5 * (size > 0) for size in sizes],
+            "bar": [
+                BAR if body.turning and index not in boxes else 0
+                for index, (_, body) in enumerate(motion.bodies)
+            ],
+            "width": [2 * width for width, _ in half],
+            "height": [2 * height if planar else 0.5 * (height > 0) for _, height in half],
             "name": labels if planar else [body.name for _, body in motion.bodies],
-            # In a plane bodies may coincide, and their names would overlap.
+            # In a plane bodies may coincide; their names are shown on separate lines.
             "above": [-8 - (LINE if planar else 0) * index for index in range(len(labels))],
             "colour": colours,
         }
-        fixed = [at for _, at in motion.walls]
+        fixed = [position for _, position in motion.walls]
         self.walls.data = {
             "x": fixed,
             "top": [row + 0.45 for row, _ in motion.walls],
@@ -413,44 +442,60 @@ class MotionFigure:
         self.discs.data = {
             name: [disc[n] for disc in motion.discs] for n, name in enumerate(("x", "y", "radius"))
         }
+        holders, held, arms = zip(*motion.contacts, strict=True) if motion.contacts else ((), (), ())
+        ends = {name: np.zeros(len(held)) for name in ("x0", "y0", "x1", "y1")}
+        arm_x, arm_y = np.reshape(arms, (-1, 2)).T
+        self.contacts.data = ends | {
+            "holder": np.array(holders, dtype=np.int32),
+            "held": np.array(held, dtype=np.int32),
+            "arm_x": arm_x,
+            "arm_y": arm_y,
+        }
         self.frames.data = {"time": motion.time, "x": x, "y": y, "angle": motion.angle}
-        reach = max(sizes)
+        reach = max([*sizes, *(float(np.hypot(*box)) for box in boxes.values())])
         low, high = min([x.min() - reach, *fixed]), max([x.max() + reach, *fixed])
-        room = ROOM * (high - low) or 1.0
+        margin = ROOM * (high - low) or 1.0
         self.plot.x_range.update(start=0.0, end=float(motion.time[-1]))
-        self.plot.y_range.update(start=float(x.min()) - room, end=float(x.max()) + room)
-        self.stage.x_range.update(start=low - room, end=high + room)
+        self.plot.y_range.update(start=float(x.min()) - margin, end=float(x.max()) + margin)
+        self.stage.x_range.update(start=low - margin, end=high + margin)
         if planar:
-            self.stage.y_range.update(start=float(y.min()) - reach - room, end=float(y.max()) + reach + room)
+            self.stage.y_range.update(
+                start=float(y.min()) - reach - margin, end=float(y.max()) + reach + margin
+            )
             self.stage.yaxis.axis_label = "position [mm]"
         else:
             self.stage.y_range.update(start=len(peers) - 0.3, end=-0.5)
-            if self.stage.yaxis[0].ticker is not self.rows:  # a document walks through all that is new to it
+            if (
+                self.stage.yaxis[0].ticker is not self.rows
+            ):  # a new ticker would cause a traversal of all models
                 self.stage.yaxis.ticker = self.rows
             self.rows.ticks = list(range(len(peers)))
             self.stage.yaxis.major_label_overrides = dict(enumerate(peers))
         slower = SECONDS / float(motion.time[-1])
         legend = "; ".join(f"{name} {word}" for name, word in zip(names, DASH_WORDS, strict=False))
         times = f"{max(slower, 1 / slower):.2g}"
-        pace = "as fast as it is" if times == "1" else f"{times} times {'slower' if slower > 1 else 'faster'}"
+        pace = "in real time"
+        if times != "1":
+            pace = f"{times} times {'slower' if slower > 1 else 'faster'} than real time"
         self.words.show_text(
             *motion.remarks,
-            f"A colour is a peer, a kind of line a body: {legend}. Played {pace}.",
+            f"Colors: peers. Lines: {legend}. Animation {pace}.",
             *([f"{motion.others} more peers are not shown."] if motion.others else []),
         )
 
     def clear(self, why: str) -> None:
-        """Show no motion, and why."""
+        """Hide the motion, and show the reason."""
         self._visible(False)
         self.words.nothing(why)
 
-    def _visible(self, there: bool) -> None:
+    def _visible(self, visible: bool) -> None:
+        """Show or hide all parts of the figure."""
         for item in (self.stage, self.simulation, self.time, self.plot):
-            item.visible = there
+            item.visible = visible
 
 
 class TransparencyFigure:
-    """The impedance at a hand's device: force by velocity, over frequency."""
+    """The impedance at a hand's device, force divided by velocity, over frequency."""
 
     def __init__(self) -> None:
         self.source = ColumnDataSource(columns("frequency", "magnitude", "phase"))
@@ -475,16 +520,20 @@ class TransparencyFigure:
             plot.line("frequency", column, source=self.source, line_color=BLUE, line_width=2)
             plot.add_tools(HoverTool(tooltips=[("Hz", "@frequency"), (column, f"@{column}")], mode="vline"))
         self.phase.yaxis.ticker = [-180, -90, 0, 90, 180]
-        self.plot.yaxis.minor_tick_line_color = None  # over less than a decade they lie on each other
+        self.plot.visible = self.phase.visible = False
+        self.plot.yaxis.ticker = LogTicker(mantissas=[1, 2, 5])
+        self.plot.yaxis.minor_tick_line_color = None  # minor labels overlap in a range of less than a decade
         self.words = LiveText("transparency-words")
 
     def show(self, result: Plain) -> None:
-        """Plot the transparency."""
+        """Draw the impedance: magnitude and phase."""
         self.plot.visible = self.phase.visible = True
         self.source.data = {name: result[name] for name in ("frequency", "magnitude", "phase")}
         f, size = result["frequency"], result["magnitude"]
         self.plot.x_range.update(start=f[0], end=f[-1])
-        self.plot.y_range.update(start=size.min() / (1 + ROOM), end=size.max() * (1 + ROOM))
+        smallest, largest = size[size > 0].min(initial=size.max()) or 1.0, size.max() or 1.0
+        margin = max((largest / smallest) ** ROOM, 1 + ROOM)  # on a logarithmic axis
+        self.plot.y_range.update(start=smallest / margin, end=largest * margin)
         self.words.show_text(
             f"At {result['at']}: {size[0]:.4g} N·s/m at {f[0]:.3g} Hz,"
             f" {size[-1]:.4g} N·s/m at {f[-1]:.3g} Hz.",
@@ -492,12 +541,12 @@ class TransparencyFigure:
         )
 
     def clear(self, why: str) -> None:
-        """Show no impedance, and why."""
+        """Hide the impedance, and show the reason."""
         self.plot.visible = self.phase.visible = False
         self.source.data = columns("frequency", "magnitude", "phase")
         self.words.nothing(why)
 
 
 def columns(*names: str) -> dict[str, list[Any]]:
-    """Return empty columns."""
+    """Return empty columns of a data source."""
     return {name: [] for name in names}

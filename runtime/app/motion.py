@@ -1,8 +1,8 @@
-"""Simulation for the page: an impulse and its response, and the moving bodies.
+"""Simulation for the page: response to an impulse or to start values, and the moving bodies.
 
 Takes: a `Model`.
 Gives: `AnimationFrames`, `motion_of`.
-Guarantees: rows are those of `simulation`, thinned to the visible resolution. A diverging motion is shown
+Guarantees: rows are rows of `simulation`, thinned to the visible resolution. A diverging motion is shown
 until it leaves the figure, with a remark.
 Does not: draw.
 """
@@ -22,24 +22,27 @@ from apc.simulation.trajectory import simulate
 
 Floats = NDArray[np.float64]
 
-# Rows that are shown: more are not seen.
+# The largest number of rows shown; more are not visible.
 ROWS = 300
-# In m: what moves farther than this from where it started has left the picture.
+# The displacement in m at which a body leaves the picture.
 FAR = 1.0
 MM = 1e3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AnimationFrames:
-    """The visible part of a model: times (rows,) in s, n bodies, and fixed surfaces: (row, mm), or discs.
+    """The visible part of a motion: times (rows,) in s, n bodies, and fixed surfaces: walls (row, mm),
+    or discs.
 
-    `x`, `y` and `angle` (rows, n) are where each body is, in mm and rad; `y` is None if all move along lines,
-    one row per peer. `bodies` are their peers and initial geometry. `remarks` is the text alternative;
+    `x`, `y` and `angle` (rows, n) are the positions of the bodies in mm and rad; `y` is None if all move
+    along lines, one line per peer. `bodies` are the peers and the shapes of the bodies; `contacts` are pairs
+    of bodies, with the grasp point along the axes of the second in mm. `remarks` is the text alternative;
     `others` is the number of peers not shown.
     """
 
     time: Floats
     bodies: tuple[tuple[str, DrawnBody], ...]
+    contacts: tuple[tuple[int, int, tuple[float, float]], ...]
     x: Floats
     y: Floats | None
     angle: Floats
@@ -50,19 +53,20 @@ class AnimationFrames:
 
 
 def motion_of(system: Model, *, struck: bool) -> AnimationFrames:
-    """Simulate a model: from its start values, or with the first peer's device struck besides.
+    """Return the simulated motion of a model: from its start values, optionally with an impulse at the
+    first peer.
 
     Parameters
     ----------
     system
         The model.
     struck
-        Whether the first peer's device is struck as it begins.
+        Whether the first peer's device has an impulse at the start.
 
     Raises
     ------
     ApcError
-        E983 nothing to strike or to see; those of `trajectory.simulate`.
+        E983 no device for the impulse, or no position to show; and the errors of `trajectory.simulate`.
     """
     planar = moves_in_plane(system)
     views = views_of(system)
@@ -71,33 +75,44 @@ def motion_of(system: Model, *, struck: bool) -> AnimationFrames:
         system, subject = initial_velocity(system)
         remarks.append(impulse_text(subject))
     shown = tuple((view.name, body) for view in views for body in view.bodies)
+    indices_of = {(peer, body.name): index for index, (peer, body) in enumerate(shown)}
+    contacts = tuple(
+        (
+            indices_of[view.name, contact.holder],
+            indices_of[view.name, contact.held],
+            (MM * contact.arm[0], MM * contact.arm[1] if planar else 0.0),
+        )
+        for view in views
+        for contact in view.contacts
+    )
     names = [
         [f"{peer}.{state}" for state in (body.states[0], body.states[planar], *body.turning)]
         for peer, body in shown
     ]
     if not names:
         raise ApcError(
-            Diagnostic("E983", SourceLocation(system.name), "nothing here has a position that could be shown")
+            Diagnostic("E983", SourceLocation(system.name), "the topology has no position to show")
         )
     duration = system.experiment.duration or WATCHED
     simulated = simulate(system, duration=duration, signals=[text for name in names for text in name])
     values, time = simulated.values, simulated.time
     indices = [number for number, signal in enumerate(simulated.signals) if signal.unit == "m"]
-    separation = np.abs(values - values[0])[:, indices].max(axis=1) > FAR
-    if separation.any():
-        last = max(int(np.argmax(separation)), 2)
+    left_picture = np.abs(values - values[0])[:, indices].max(axis=1) > FAR
+    if left_picture.any():
+        last = max(int(np.argmax(left_picture)), 2)
         values, time = values[:last], time[:last]
-        remarks.append(f"Shown until something is {FAR:g} m from where it began.")
-    texts = np.unique(np.linspace(0, len(time) - 1, min(ROWS, len(time))).astype(int))
+        remarks.append(f"Shown until a displacement of {FAR:g} m.")
+    row_indices = np.unique(np.linspace(0, len(time) - 1, min(ROWS, len(time))).astype(int))
     columns = {signal.name: index for index, signal in enumerate(simulated.signals)}
-    tracks = [values[texts][:, [columns[text] for text in name]] for name in names]
+    tracks = [values[row_indices][:, [columns[text] for text in name]] for name in names]
     x, y = (np.stack([track[:, index] for track in tracks], axis=1) for index in (0, 1))
     angle = np.stack([heading(track[:, 2:]) for track in tracks], axis=1)
     fixed = [(row, surface) for row, view in enumerate(views) for surface in view.surfaces]
     remarks.append(f"Motion: {simulated.summary.verdict}.")
     return AnimationFrames(
-        time=time[texts],
+        time=time[row_indices],
         bodies=shown,
+        contacts=contacts,
         x=MM * x,
         y=MM * y if planar else None,
         angle=angle,

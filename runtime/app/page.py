@@ -1,10 +1,10 @@
-"""The page: sliders on the left, and the results, redrawn when sliders move.
+"""The page: sliders and results, which are updated when sliders move.
 
 Takes: a compiled model; a Bokeh document per tab.
 Gives: `SharedState`, `topology_of`, `open_page`.
 Guarantees: results correspond to the slider values, and an invalid value changes nothing. The server thread
-does not compute. The link contains the values of moved sliders, and a link with values restores them.
-Does not: compute.
+does not compute. The link contains the values of moved sliders, and opening the link restores these values.
+Does not: compute results (see `sections`).
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from apc.app.figures import FOCUS, LiveText, MotionFigure, RegionFigure, RootsFi
 from apc.app.sections import SectionAnswer, Task
 from apc.app.server import TOKEN
 from apc.app.sliders import (
-    PEOPLE,
+    PEER_COUNTS,
     Slider,
     axes_of,
     is_member_of,
@@ -39,42 +39,41 @@ from apc.app.sliders import (
     sliders_of,
     with_value,
 )
-from apc.app.worker_process import Desk
+from apc.app.worker_process import SectionWorker
 from apc.app.yaml_edit import with_values
 from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError
-from apc.distribution import program_version
-from apc.frame.linearize import reaches_start
-from apc.frame.overrides import Override, apply
-from apc.frame.parameter_names import Range
+from apc.linearization.linearize import reaches_start
+from apc.network.nominal_criterion import unreliable
 from apc.output.formatting import Plain, json_text
-from apc.parameter_studies.evaluator import reaches_count, reaches_time
-from apc.parameter_studies.stability_criteria import MEAN_SQUARE, NOMINAL
-from apc.processes import model_bytes
+from apc.parameter_values.overrides import Override, apply
+from apc.parameter_values.parameter_names import Range
+from apc.studies.evaluator import reaches_count, reaches_time
+from apc.studies.stability_criteria import MEAN_SQUARE, NOMINAL
+from apc.support.distribution import program_version
+from apc.support.processes import model_bytes
 
-# Who computes what, first things first: what is redrawn while a slider moves waits for nothing else. A region
-# whose points are analysed one by one takes many seconds, and comes last.
+# The worker processes and their sections, by priority: sections that are redrawn while a slider moves wait
+# for no other section. A region whose points are analyzed one by one takes many seconds, and comes last.
 VERDICT, REGION, LATER, TUNED = 0, 1, 2, 3
-DESKS = (
+WORKER_SECTIONS = (
     ("verdict",),
     ("region",),
     ("numbers", "roots", "motion", "transparency", "margins", "network", "region"),
     ("tune",),
 )
-# Seconds, a few frames of a browser, after which eigenvalues are drawn next to an existing region.
+# Seconds (a few frames of a browser) after which eigenvalues are drawn if a region was drawn.
 FRAMES = 0.05
-# Arguments of the link: the sliders on the axes of the region. No name of a model has a hyphen.
+# Arguments of the link: the parameters on the axes of the region. Names in a model have no hyphen.
 X, Y = "x-axis", "y-axis"
-STRUCK, BEGINS = "the first peer is struck", "as the topology begins"
+STRUCK, BEGINS = "impulse on the first device", "initial state of the topology"
 SAME_AXES = "A region has two different parameters: choose another one for an axis."
-TUNES = (
-    "The button looks for the largest {} with which the topology is stable, {} chosen with it, and proves it."
-)
-STUDIED = "The button looks for the gains that the topology's studies: tune: asks for, and proves them."
-NO_AXES = "A region has two parameters, and this topology has fewer that are numbers of a range."
-LIVE, SLOW = "every packet is on time", "packets as they are lost and late (takes long)"
+TUNES = "Determines the largest stable {} with {} free, and proves stability."
+STUDIED = "Determines the gains of the study tune: of the topology, and proves stability."
+NO_AXES = "A region has two parameters, and this topology has fewer with a range."
+LIVE, SLOW = "nominal (every packet on time)", "mean-square (lossy network, slower)"
 
-# Handles have their sliders' names, with values as displayed.
+# The handles have the names and displayed values of their sliders, for screen readers.
 NAMED = """
 for (const slider of sliders) {
   const handle = Bokeh.index.get_one(slider).shadow_el.querySelector('.noUi-handle')
@@ -88,7 +87,7 @@ for (const slider of sliders) {
 }
 document.documentElement.dataset.ready = 'yes'
 """
-# Browsers refuse more than a few changes of the link a second.
+# Browsers refuse more than a few changes of the link per second.
 LINKED = """
 clearTimeout(window.apc_link)
 window.apc_link = setTimeout(() => {
@@ -98,7 +97,7 @@ window.apc_link = setTimeout(() => {
 """
 
 
-# What is downloaded is handed to the page as a text, and from there to a file.
+# A download is sent to the page as a text, and saved by the page to a file.
 SAVED = """
 const [name, text] = [out.data.name[0], out.data.text[0]]
 const link = document.createElement('a')
@@ -107,7 +106,7 @@ link.download = name
 link.click()
 setTimeout(() => URL.revokeObjectURL(link.href), 1000)
 """
-# The figures as they are seen, below each other.
+# A picture with the visible figures, one below the other.
 PICTURED = """
 const parts = plots.map(plot => Bokeh.index.get_one(plot).export('auto', true).canvas)
 const whole = document.createElement('canvas')
@@ -130,9 +129,9 @@ whole.toBlob(blob => {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SharedState:
-    """Data common to all tabs: the model, its bytes for the workers, its sliders and their values.
+    """Data common to all tabs: the model, its bytes for the workers, the sliders and the initial settings.
 
-    `text` is the topology, None where there is only a compiled model.
+    `text` is the topology, None if there is only a compiled model.
     """
 
     system: Model
@@ -150,14 +149,14 @@ def topology_of(system: Model, settings: Sequence[str], text: str | None) -> Sha
     system
         The model.
     settings
-        Numbers that are set at first, each `NAME=QUANTITY`.
+        Initial settings of sliders, each `NAME=QUANTITY`.
     text
-        The topology.
+        The text of the topology, None if there is only a compiled model.
 
     Raises
     ------
     ApcError
-        E980 a number without a slider; those of `overrides.parse_override` and `overrides.apply`.
+        E980 a parameter without a slider; and the errors of `overrides.parse_override` and `overrides.apply`.
     """
     sliders = sliders_of(system)
     pairs = [set_to(system, sliders, setting) for setting in settings]
@@ -171,17 +170,18 @@ def open_page(topology: SharedState, document: Document) -> None:
 
 
 class TopologyTab:
-    """One tab: its sliders and where they are, its figures, and who computes for it."""
+    """One tab: its sliders and their positions, its figures, and its worker processes."""
 
     def __init__(self, topology: SharedState, document: Document) -> None:
+        """Create the sliders, figures and workers of a tab, and request all results."""
         self.topology, self.system, self.document = topology, topology.system, document
         self.sliders, self.positions = list(topology.sliders), [slider.start for slider in topology.sliders]
-        self.chosen = self._axes_at_first()
+        self.chosen = self._initial_axes()
         self.message = LiveText("message")
         self.message.model.text = ""
         for setting in topology.settings:
-            self._start_at(setting)
-        self._take_link(document.session_context.request.arguments)
+            self._set_initially(setting)
+        self._read_link(document.session_context.request.arguments)
         self.verdict, self.margins, self.network = (
             LiveText("verdict"),
             LiveText("margins"),
@@ -190,27 +190,29 @@ class TopologyTab:
         self.tuned = LiveText("tuned")
         self.region, self.roots = RegionFigure(), RootsFigure()
         self.motion, self.transparency = MotionFigure(), TransparencyFigure()
-        self.modes: Plain | None = None  # of the newest verdict
-        # Whether the model is linear, and batches of points are possible: known from the first verdict.
+        self.modes: Plain | None = None  # the eigenvalues of the newest verdict
+        # Whether the model is linear, and batches of points can be analyzed: known from the first verdict.
         self.linear: bool | None = None
         self.at_once = False
         self.moving, self.last = False, self.chosen[0] if self.chosen else 0
         self.link = ColumnDataSource({"query": [""]})
         self.link.js_on_change("data", CustomJS(args={"link": self.link}, code=LINKED))
-        self.desks = [Desk(topology.model, order, self._next_tick, self._deliver) for order in DESKS]
+        self.workers = [
+            SectionWorker(topology.model, order, self._next_tick, self._deliver) for order in WORKER_SECTIONS
+        ]
         for first in (VERDICT, REGION):
-            self.desks[first].put_before(self.desks[LATER])
+            self.workers[first].precede(self.workers[LATER])
         self._lay_out()
         document.on_session_destroyed(lambda session_context: self._close())
-        self._moved()
+        self._update_all()
 
-    def _axes_at_first(self) -> list[int]:
-        """Return the sliders on the axes of the region, those the model studies first; none without two."""
+    def _initial_axes(self) -> list[int]:
+        """Return the initial sliders on the axes of the region; empty if fewer than two are possible."""
         numbers = [index for index, slider in enumerate(self.sliders) if slider.span is not None]
         return numbers[:2] if len(numbers) > 1 else []
 
-    def _take_link(self, arguments: Mapping[str, list[bytes]]) -> None:
-        """Set the sliders from the link."""
+    def _read_link(self, arguments: Mapping[str, list[bytes]]) -> None:
+        """Set sliders and axes from the arguments of the link; invalid arguments are shown as a message."""
         wrong = []
         for name, values in arguments.items():
             text = values[-1].decode("utf-8", "replace")
@@ -221,22 +223,25 @@ class TopologyTab:
                 if axes and self.chosen:
                     self.chosen[(X, Y).index(name)] = axes[0]
                 else:
-                    wrong.append(f"{text} can be no axis of the region")
-            elif name != "bokeh-session-id" and (name != TOKEN or len(values) > 1):  # a number may be a token
+                    wrong.append(f"{text} cannot be an axis of the region")
+            elif name != "bokeh-session-id" and (
+                name != TOKEN or len(values) > 1
+            ):  # a model parameter may have the name `token`
                 try:
-                    self._start_at(f"{name}={text}")
+                    self._set_initially(f"{name}={text}")
                 except ApcError as error:
                     wrong += [mistake.sentence for mistake in error.mistakes]
         if wrong:
-            self.message.show_text("The link says what can't be:", *wrong)
+            self.message.show_text("Invalid arguments of the link:", *wrong)
 
-    def _start_at(self, setting: str) -> None:
-        """Set a slider before the page is shown; its value need be none that the slider had."""
+    def _set_initially(self, setting: str) -> None:
+        """Set a slider before the page is shown; the value is added to the values of the slider."""
         index, value = set_to(self.system, self.sliders, setting)
         apply(self.system, [Override(self.sliders[index].free, value)])
         self.sliders[index], self.positions[index] = with_value(self.sliders[index], value)
 
     def _lay_out(self) -> None:
+        """Create the controls, and add them with the figures to the document."""
         self.handles = [self._handle(index) for index in range(len(self.sliders))]
         names = [slider.label for slider in self.sliders if slider.span is not None]
         self.selects = [
@@ -244,49 +249,60 @@ class TopologyTab:
             for axis, index in zip(("horizontal", "vertical"), self.chosen, strict=False)
         ]
         for number, select in enumerate(self.selects):
-            self._receive(select, partial(is_member_of, names), partial(self._choose, number))
-        self.region.plot.on_event(Tap, self._tapped)
+            self._on_change(select, partial(is_member_of, names), partial(self._choose, number))
+        self.region.plot.on_event(Tap, self._on_tap)
         duration = self.system.experiment.duration
-        self.begins = Select(
-            title="What is played",
+        self.start_select = Select(
+            title="Excitation",
             options=[STRUCK, BEGINS],
             value=BEGINS if duration else STRUCK,
             stylesheets=[FOCUS],
         )
-        self._receive(self.begins, partial(is_member_of, (STRUCK, BEGINS)), lambda _: self._moved())
-        self.meant = Select(title="Stable, where", options=[LIVE, SLOW], value=LIVE, stylesheets=[FOCUS])
-        self._receive(self.meant, partial(is_member_of, (LIVE, SLOW)), lambda _: self._moved())
-        self.at = Select(title="The hand holds", visible=False, stylesheets=[FOCUS])
+        self._on_change(
+            self.start_select, partial(is_member_of, (STRUCK, BEGINS)), lambda _: self._update_all()
+        )
+        self.criterion_select = Select(
+            title="Stability criterion",
+            options=[LIVE, SLOW],
+            value=SLOW if unreliable(self.system) else LIVE,
+            stylesheets=[FOCUS],
+        )
+        self._on_change(
+            self.criterion_select, partial(is_member_of, (LIVE, SLOW)), lambda _: self._update_all()
+        )
+        self.device_select = Select(title="Device", visible=False, stylesheets=[FOCUS])
         self.held: list[str] = []
-        self._receive(
-            self.at, lambda name: is_member_of(self.held, name), lambda _: self._request_transparency()
+        self._on_change(
+            self.device_select,
+            lambda name: is_member_of(self.held, name),
+            lambda _: self._request_transparency(),
         )
         controls: list[Any] = [self.message.model, *self.selects]
         if any(link.channel is not None for link in self.system.links):
-            controls.append(self.meant)
+            controls.append(self.criterion_select)
         controls.append(row(*self._buttons(), sizing_mode="stretch_width"))
         kinds = dict.fromkeys(slider.kind for slider in self.sliders)
-        for kind in sorted(kinds, key=lambda kind: kind != PEOPLE):  # how many there are comes first
+        for kind in sorted(kinds, key=lambda kind: kind != PEER_COUNTS):  # numbers of peers come first
             heading = Div(text=f"<h2 style='font-size:15px;margin:10px 0 0'>{kind.capitalize()}</h2>")
-            local = [
+            kind_handles = [
                 handle
                 for handle, slider in zip(self.handles, self.sliders, strict=True)
                 if slider.kind == kind
             ]
-            controls += [heading, *local]
-        self.tune = Button(label="Tune", stylesheets=[FOCUS], name="tune", width=120)
-        self.tune.on_click(self._ask_tune)
+            controls += [heading, *kind_handles]
+        self.tune = Button(label="Tune", stylesheets=[FOCUS], name="tune", width=320)
+        self.tune.on_click(self._start_tuning)
         motion, transparency = self.motion, self.transparency
         simulated = row(motion.simulation, motion.time, sizing_mode="stretch_width")
-        # Words stand by themselves: in one layout with a figure, they have it drawn again when they change.
+        # Texts are separate roots: a changed text in the same layout would redraw a figure.
         for part in (
-            _below("controls", *controls, tags=[self.link, self.out]),
+            _column("controls", *controls, tags=[self.link, self.out]),
             self.region.plot,
             self.roots.plot,
             self.tune,
             self.tuned.model,
-            _below("motion", self.begins, motion.stage, simulated, motion.plot),
-            _below("transparency", self.at, transparency.plot, transparency.phase),
+            _column("motion", self.start_select, motion.stage, simulated, motion.plot),
+            _column("transparency", self.device_select, transparency.plot, transparency.phase),
             *(words.model for words in (self.verdict, self.margins, self.region.words, self.network)),
             *(
                 words.model
@@ -302,7 +318,7 @@ class TopologyTab:
         self.document.template_variables["description"] = self.system.description
 
     def _buttons(self) -> list[Button]:
-        """Return the buttons that download the topology, the picture and the numbers."""
+        """Return the buttons for the download of the topology, the picture and the numbers."""
         self.out = ColumnDataSource({"name": [""], "text": [""]})
         self.out.js_on_change("data", CustomJS(args={"out": self.out}, code=SAVED))
         topology, picture, numbers = (
@@ -321,63 +337,64 @@ class TopologyTab:
         ]
         name = f"{self.system.name}.png"
         picture.js_on_event("button_click", CustomJS(args={"plots": plots, "name": name}, code=PICTURED))
-        numbers.on_click(self._ask_numbers)
+        numbers.on_click(self._request_numbers)
         return [topology, picture, numbers]
 
     def _save_topology(self) -> None:
-        """Hand over the topology with the values of the sliders."""
+        """Download the topology with the values of the sliders."""
         if self.topology.text is None:
-            self.message.show_text(
-                "There is no topology beside this compiled model, whose text could be given."
-            )
+            self.message.show_text("The topology of this compiled model is not available.")
             return
         values = {
             slider.free: slider.texts[index] for slider, index in self._pairs() if index != slider.start
         }
         try:
             text = with_values(self.topology.text, self.system, values)
-        except ApcError as error:  # the number is in a table of peers
+        except ApcError as error:  # the number is in a table of peer values
             self.message.show_text(
-                "The topology can't be written:", *(item.sentence for item in error.mistakes)
+                "The topology cannot be written:", *(item.sentence for item in error.mistakes)
             )
             return
         self.out.data = {"name": [f"{self.system.name}.yaml"], "text": [text]}
 
-    def _ask_numbers(self) -> None:
-        """Have the numbers computed that are downloaded."""
-        self.desks[LATER].forget("numbers")  # who asks twice wants two files
-        self._ask("numbers", self._overrides, self._request_region())
+    def _request_numbers(self) -> None:
+        """Request the numbers for download."""
+        self.workers[LATER].cancel("numbers")  # a repeated request gives a second file
+        self._request("numbers", self._overrides, self._region_request())
 
-    def _request_tuning(self) -> tuple[tuple[str, ...], str] | None:
-        """Return the gains on the axes and the one to maximize; none if a study specifies them."""
+    def _tuning_request(self) -> tuple[tuple[str, ...], str] | None:
+        """Return the ranges of the gains on the axes and the gain to maximize.
+
+        The ranges are empty if a study specifies the gains; the result is None without axes.
+        """
         if self.system.tune:
             return (), ""
-        if (axes := self._request_region()) is None:
+        if (axes := self._region_request()) is None:
             return None
         spans = (
             f"{axis.free.label}={float(axis.low)!r} {axis.unit}:{float(axis.high)!r} {axis.unit}"
             for axis in axes[:2]
         )
-        return tuple(spans), axes[1].free.label
+        return tuple(spans), axes[0].free.label
 
-    def _ask_tune(self) -> None:
-        """Start the gain optimization from the present values of all other sliders."""
-        if (requested := self._request_tuning()) is not None:
-            self.desks[TUNED].forget("tune")  # who asks twice wants it twice
+    def _start_tuning(self) -> None:
+        """Request the optimal gains for the present values of all other sliders."""
+        if (request := self._tuning_request()) is not None:
+            self.workers[TUNED].cancel("tune")  # a repeated request is computed again
             self.tuned.show_text("Computing …")
-            self._ask("tune", self._overrides, requested)
+            self._request("tune", self._overrides, request)
 
-    def _untuned(self) -> None:
-        """Show the objective on the button, instead of the gains for other slider values."""
-        self.desks[TUNED].forget("tune")
-        requested = self._request_tuning()
+    def _reset_tuning(self) -> None:
+        """Replace the gains, which belong to other slider values, by the text of the objective."""
+        self.workers[TUNED].cancel("tune")
+        request = self._tuning_request()
         names = [self.sliders[number].label for number in self.chosen]
-        self.tune.disabled = requested is None
-        self.tuned.show_text(
-            NO_AXES if requested is None else TUNES.format(*reversed(names)) if requested[0] else STUDIED
-        )
+        self.tune.disabled = request is None
+        self.tuned.show_text(NO_AXES if request is None else TUNES.format(*names) if request[0] else STUDIED)
+        self.tune.label = f"Maximize {request[1]}" if request and request[1] else "Tune"
 
     def _save_numbers(self, result: Plain) -> None:
+        """Download the results as JSON, with the slider values."""
         values = {slider.label: slider.texts[index] for slider, index in self._pairs()}
         answer = {"topology": self.system.name, "apc": program_version(), "set": values, **result}
         self.out.data = {"name": [f"{self.system.name}.json"], "text": [json_text(answer)]}
@@ -388,10 +405,11 @@ class TopologyTab:
         return tuple(overrides_of(self.sliders, self.positions))
 
     def _pairs(self) -> list[tuple[Slider, int]]:
+        """Return the sliders with their positions."""
         return list(zip(self.sliders, self.positions, strict=True))
 
     def _handle(self, index: int) -> Handle:
-        """Return the slider of a number, which counts its values."""
+        """Return the browser slider of a parameter; its value is the index of the parameter value."""
         slider = self.sliders[index]
         texts = [text.replace("*", "·") for text in slider.texts]
         handle = Handle(
@@ -406,134 +424,143 @@ class TopologyTab:
             stylesheets=[FOCUS],
             disabled=len(texts) == 1,
         )
-        self._receive(handle, partial(is_position, slider), lambda value: self._set({index: round(value)}))
+        self._on_change(handle, partial(is_position, slider), lambda value: self._set({index: round(value)}))
         return handle
 
-    def _receive(self, model: Any, may: Callable[[Any], bool], then: Callable[[Any], None]) -> None:
-        """Handle a change of a model's value in the browser; an invalid value is reset.
+    def _on_change(
+        self, model: Any, is_valid: Callable[[Any], bool], on_value: Callable[[Any], None]
+    ) -> None:
+        """Call a function for each change of a control's value in the browser; an invalid value is reset.
 
         Parameters
         ----------
         model
-            A slider or a choice: it has a title and a value.
-        may
-            Whether a value, of whatever type, is one that the model may have.
-        then
-            Called with the value.
+            The control, a slider or a selection, with a title and a value.
+        is_valid
+            The function that returns whether a value of any type is valid.
+        on_value
+            The function called with a valid value.
         """
 
-        def changed(attr: str, old: Any, new: Any) -> None:
+        def on_change(attr: str, old: Any, new: Any) -> None:
+            """Handle a change by the browser; changes by the page itself are ignored."""
             if self.moving:
                 return
-            if may(new):
-                then(new)
+            if is_valid(new):
+                on_value(new)
                 return
-            self._put({model: old})
-            self.message.show_text(f"{model.title} can't be {new!r:.40}, and stays as it was.")
+            self._set_values({model: old})
+            self.message.show_text(f"{model.title}: {new!r:.40} is invalid; the value is unchanged.")
 
-        model.on_change("value", changed)
+        model.on_change("value", on_change)
 
-    def _put(self, values: Mapping[Any, Any]) -> None:
-        """Give models their values, which is no wish of somebody's."""
+    def _set_values(self, values: Mapping[Any, Any]) -> None:
+        """Set the values of controls, without handling the changes as input."""
         self.moving = True
         for model, value in values.items():
             model.value = value
         self.moving = False
 
-    def _set(self, indices: Mapping[int, int]) -> None:
-        """Take the values of sliders that were moved, and move those that were not moved by hand."""
-        for number, location in indices.items():
-            self.positions[number], self.last = location, number
-        self._put({self.handles[number]: location for number, location in indices.items()})
-        self._moved()
+    def _set(self, positions: Mapping[int, int]) -> None:
+        """Set the positions of sliders, by index, and update all sections."""
+        for number, position in positions.items():
+            self.positions[number], self.last = position, number
+        self._set_values({self.handles[number]: position for number, position in positions.items()})
+        self._update_all()
 
-    def _tapped(self, event: Any) -> None:
-        """Set the sliders of both axes to where the region was clicked, if that is somewhere."""
+    def _on_tap(self, event: Any) -> None:
+        """Set the sliders of both axes to the values at a click in the region."""
         if not (is_number(event.x) and is_number(event.y)):
             return
         pairs = zip(self.chosen, (event.x, event.y), strict=False)
-        self._set({number: position_of(self.sliders[number], at) for number, at in pairs})
+        self._set({number: position_of(self.sliders[number], value) for number, value in pairs})
 
     def _choose(self, axis: int, label: str) -> None:
-        """Take another axis for the region."""
+        """Set the parameter on an axis of the region, and update all sections."""
         self.chosen[axis] = [slider.label for slider in self.sliders].index(label)
-        self._moved()
+        self._update_all()
 
-    def _moved(self) -> None:
-        """Ask for everything anew."""
+    def _update_all(self) -> None:
+        """Request the results of all sections for the present slider values."""
         overrides = self._overrides
-        self._ask("verdict", overrides)
+        self._request("verdict", overrides, self._criterion)
         if self.sliders:
-            moved = self.sliders[self.last]
-            others = tuple(override for override in overrides if override.free != moved.free)
-            self._ask("roots", others, (moved.free, moved.values))
-        self._ask_region(overrides)
-        self._ask("motion", overrides, self.begins.value == STRUCK)
+            slider = self.sliders[self.last]
+            others = tuple(override for override in overrides if override.free != slider.free)
+            self._request("roots", others, (slider.free, slider.values))
+        self._update_region(overrides)
+        self._request("motion", overrides, self.start_select.value == STRUCK)
         self._request_transparency()
-        self._untuned()
+        self._reset_tuning()
         for section in ("margins", "network"):
-            self._ask(section, overrides)
+            self._request(section, overrides)
         self.link.data = {"query": [self._query()]}
 
     def _request_transparency(self) -> None:
         """Request the transparency at the selected hand."""
-        self._ask("transparency", self._overrides, self.at.value)
+        self._request("transparency", self._overrides, self.device_select.value)
 
-    def _ask_region(self, overrides: tuple[Override, ...]) -> None:
-        """Ask for the region, if there are two axes: nobody waits for it where it takes long."""
-        requested = self._request_region()
-        if requested is None:
-            for desk in self.desks:
-                desk.forget("region")
+    def _update_region(self, overrides: tuple[Override, ...]) -> None:
+        """Request the region for the present slider values if there are two axes."""
+        request = self._region_request()
+        if request is None:
+            for worker in self.workers:
+                worker.cancel("region")
             self.region.clear(SAME_AXES if self.chosen else NO_AXES)
             return
         if self.linear is None:
             return
         # A parameter on an axis covers its entire range there.
         others = tuple(
-            override for override in overrides if override.free not in (requested[0].free, requested[1].free)
+            override for override in overrides if override.free not in (request[0].free, request[1].free)
         )
-        slow = self._slow(requested)
-        self.desks[REGION if slow else LATER].forget("region")
-        if self.desks[LATER if slow else REGION].ask(Task("region", others, requested)) and slow:
-            self.region.clear(f"Computing, after all else: {slow}, which takes a while.")
+        slow = self._reason_not_live(request)
+        self.workers[REGION if slow else LATER].cancel("region")
+        if self.workers[LATER if slow else REGION].submit(Task("region", others, request)) and slow:
+            self.region.clear(f"Computing … ({slow}; after all other sections)")
         self.region.mark(
             *(float(self.sliders[number].values[self.positions[number]]) for number in self.chosen)
         )
 
-    def _slow(self, requested: tuple[Range, Range, str]) -> str:
-        """Return the reason why a region cannot be redrawn live; empty if it can."""
-        x, y, criterion = requested
+    def _reason_not_live(self, request: tuple[Range, Range, str]) -> str:
+        """Return the reason why a region cannot be updated while a slider moves; empty if it can."""
+        x, y, criterion = request
         if criterion == MEAN_SQUARE:
-            return "it looks at packets as they are lost and late"
+            return "mean-square stability"
         if not self.at_once or (
             not self.linear and any(reaches_start(self.system, interval.free) for interval in (x, y))
         ):
-            return "the topology is not linear, and is linearized at its start for each point by itself"
+            return "a nonlinear topology, linearized at the start for each point"
         if any(reaches_time(self.system, interval.free) for interval in (x, y)):
-            return "as a time varies, each point has a schedule of its own"
+            return "a varied time, with one schedule per point"
         if any(reaches_count(self.system, interval.free) for interval in (x, y)):
-            return "each number of peers is analysed by itself"
+            return "a varied number of peers, with one analysis per point"
         return ""
 
-    def _request_region(self) -> tuple[Range, Range, str] | None:
-        """Return the axes of the region, and its stability criterion; None without two axes."""
+    def _region_request(self) -> tuple[Range, Range, str] | None:
+        """Return the axes of the region and its stability criterion; None without two axes."""
         if len(set(self.chosen)) < 2:
             return None
         axes = axes_of(self.sliders, self.positions, (self.chosen[0], self.chosen[1]))
-        return (*axes, NOMINAL if self.meant.value == LIVE else MEAN_SQUARE)
+        return (*axes, self._criterion)
 
-    def _ask(self, section: str, overrides: tuple[Override, ...], requested: Any = None) -> None:
-        desk = next(desk for desk in self.desks if section in desk.order)
-        desk.ask(Task(section, overrides, requested))
+    @property
+    def _criterion(self) -> str:
+        """The selected stability criterion."""
+        return NOMINAL if self.criterion_select.value == LIVE else MEAN_SQUARE
+
+    def _request(self, section: str, overrides: tuple[Override, ...], request: Any = None) -> None:
+        """Submit the task of a section to its worker."""
+        worker = next(worker for worker in self.workers if section in worker.order)
+        worker.submit(Task(section, overrides, request))
 
     def _close(self) -> None:
-        """End those who compute for this tab."""
-        for desk in self.desks:
-            desk.close()
+        """End the workers of this tab."""
+        for worker in self.workers:
+            worker.close()
 
     def _query(self) -> str:
-        """Return the part of the link that holds values and axes."""
+        """Return the arguments of the link for the moved sliders and the axes."""
         pairs = [
             (slider.label, slider.texts[index]) for slider, index in self._pairs() if index != slider.start
         ]
@@ -543,20 +570,20 @@ class TopologyTab:
         return "".join(f"&{quote(name)}={quote(text, safe='')}" for name, text in pairs)
 
     def _next_tick(self, call: Any, seconds: float) -> None:
-        """Call on the thread of the page, if the page is not closed by then."""
-        with suppress(AttributeError):  # a document that Bokeh has destroyed has no list of callbacks
+        """Schedule a call in the server thread, unless the page is closed by then."""
+        with suppress(AttributeError):  # a destroyed document of Bokeh has no list of callbacks
             if seconds:
                 self.document.add_timeout_callback(call, round(1000 * seconds))
             else:
                 self.document.add_next_tick_callback(call)
 
     def _deliver(self, section: str, answer: SectionAnswer) -> None:
-        """Show the result of a section."""
+        """Show the result of a section, or the reason if there is none."""
         result = answer.result
         if section == "verdict" and self.linear is None:
             self.linear = result is not None and result["linear"]
             self.at_once = result is not None and result["at_once"]
-            self._ask_region(self._overrides)
+            self._update_region(self._overrides)
         if section == "region" and self.modes is not None:
             self._next_tick(lambda: self.roots.show(self.modes), FRAMES)
         if result is None:
@@ -565,13 +592,13 @@ class TopologyTab:
                 "transparency": self.transparency.clear,
                 "motion": self.motion.clear,
             }
-            clearing.get(section, self._words(section).nothing)(answer.why)
+            clearing.get(section, self._text_of(section).nothing)(answer.why)
             return
         match section:
             case "verdict":
                 self.verdict.verdict(result)
                 self.modes = result
-                if self.desks[REGION].busy is None:
+                if self.workers[REGION].busy is None:
                     self.roots.show(result)
             case "roots":
                 self.roots.path_of(result)
@@ -583,18 +610,19 @@ class TopologyTab:
                 self.transparency.show(result)
                 self.held = result["names"]
                 if len(self.held) > 1:
-                    self.at.update(options=self.held, value=result["at"], visible=True)
+                    self.device_select.update(options=self.held, value=result["at"], visible=True)
             case "numbers":
                 self._save_numbers(result)
             case _:
-                self._words(section).table(result["text"])
+                self._text_of(section).table(result["text"])
 
-    def _words(self, section: str) -> LiveText:
+    def _text_of(self, section: str) -> LiveText:
+        """Return the text of the page that shows a section."""
         words = {"verdict": self.verdict, "roots": self.roots.path_text}
         words |= {"margins": self.margins, "network": self.network, "tune": self.tuned}
         return words.get(section, self.message)
 
 
-def _below(name: str, *models: Any, tags: Sequence[Any] = ()) -> Any:
-    """Return models below each other, as wide as their place."""
+def _column(name: str, *models: Any, tags: Sequence[Any] = ()) -> Any:
+    """Return models as a column of the layout, with the full width."""
     return column(*models, name=name, sizing_mode="stretch_width", tags=list(tags))

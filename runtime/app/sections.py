@@ -23,39 +23,39 @@ from apc.app.sliders import text_of
 from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.wording import in_hertz
-from apc.eigen.spectrum import Mode
-from apc.frame.evaluation_errors import finite_equations
-from apc.frame.numeric_model import Prepared, prepare
-from apc.frame.overrides import Override, apply
-from apc.frame.parameter_names import ParameterRef, Range, unit_of
 from apc.haptics.device_port import read_frequencies
 from apc.haptics.frequency_response import transparency
-from apc.haptics.peer_responses import gripped_names
+from apc.haptics.peer_responses import device_labels
+from apc.lifting.numeric_model import NumericModel, numeric_model
+from apc.linearization.evaluation_errors import finite_equations
 from apc.mean_square.mean_square_stability import mean_square_stability
 from apc.output.formatting import Plain
 from apc.output.region_picture import plotted_points, stable_outlines
-from apc.parameter_studies.critical_values import critical
-from apc.parameter_studies.evaluator import reaches_count, reaches_time
-from apc.parameter_studies.margins import margins
-from apc.parameter_studies.root_locus import eigenvalues_at
-from apc.parameter_studies.stability_criteria import MEAN_SQUARE
-from apc.processes import model_of_bytes
+from apc.parameter_values.overrides import Override, apply
+from apc.parameter_values.parameter_names import ParameterRef, Range, unit_of
 from apc.regions.stable_region import region
+from apc.spectrum.spectrum import Mode
+from apc.studies.critical_values import critical
+from apc.studies.evaluator_choice import EvaluatorKind, kind_for_parameter
+from apc.studies.margins import margins
+from apc.studies.root_locus import eigenvalues_at
+from apc.studies.stability_criteria import MEAN_SQUARE
+from apc.support.processes import model_of_bytes
 from apc.tuning.specification import gripped_as_studied, read_tuning_spec
 from apc.tuning.tuner import tune
 
-# The relative error of a displayed boundary: below visibility.
+# The relative error of a displayed boundary, which is not visible.
 PLOTTED = 1e-5
-# Frequencies of the transparency analysis, and the lowest.
-FREQUENCIES, LOWEST = 120, "0.1 Hz"
-# Values of a slider at which eigenvalues are found; of a time or a count, where each takes an analysis.
+# The number of frequencies of the transparency analysis, which resolves peaks, and the lowest frequency.
+FREQUENCIES, LOWEST = 480, "0.1 Hz"
+# The number of slider values for eigenvalues; fewer for a time or a count, where each requires an analysis.
 ROOTS, FEW_ROOTS = 61, 16
 EMPTY = np.zeros(0, dtype=np.complex128)
 
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """A computation: a section, the changed parameters, and options of the section."""
+    """A computation: a section, the changed parameters, and the options of the section."""
 
     section: str
     overrides: tuple[Override, ...]
@@ -64,17 +64,16 @@ class Task:
 
 @dataclass(frozen=True, slots=True)
 class SectionAnswer:
-    """The result of a section, as plain data and arrays; None with the reason in `why`."""
+    """The result of a section, as plain data and arrays; None if there is none, with the reason in `why`."""
 
     result: Plain | None
     why: str = ""
 
 
 @lru_cache(maxsize=1)
-def _open_model(model: bytes) -> tuple[Model, Prepared]:
-    """Return the model of a page, and its numeric model, which all its analyses share."""
-    system = model_of_bytes(model)
-    return system, prepare(system)
+def _open_model(model: bytes) -> NumericModel:
+    """Return the model of a page, cached for all sections."""
+    return numeric_model(model_of_bytes(model))
 
 
 def compute(model: bytes, task: Task) -> SectionAnswer:
@@ -88,57 +87,70 @@ def compute(model: bytes, task: Task) -> SectionAnswer:
         The task.
     """
     try:
-        system, prepared = _open_model(model)
-        changed = apply(system, task.overrides)
-        return SectionAnswer(SECTIONS[task.section](changed, prepared, task.request))
+        numeric = _open_model(model)
+        changed = numeric.at(apply(numeric.model, task.overrides))
+        return SectionAnswer(SECTIONS[task.section](changed, task.request))
     except ApcError as error:
-        return SectionAnswer(
-            None, "\n".join(mistake.reason for mistake in error.mistakes)
-        )  # whose hints are for the terminal
-    except Exception as error:  # the other sections go on
-        return SectionAnswer(
-            None, f"This is a bug of apc, not of your topology: {type(error).__name__}: {error}"
-        )
+        # Without fixes, which are for the command line.
+        return SectionAnswer(None, "\n".join(mistake.reason for mistake in error.mistakes))
+    except Exception as error:  # the other sections are not affected
+        return SectionAnswer(None, f"Internal error of apc: {type(error).__name__}: {error}")
 
 
-def _verdict(system: Model, prepared: Prepared, _: None) -> Plain:
-    analysis = analyze(system, prepared=prepared)
+def _verdict(numeric: NumericModel, criterion: str | None) -> Plain:
+    """Return the verdict of the stability analysis by a criterion, and the eigenvalues."""
+    analysis = analyze(numeric)
+    network = mean_square_stability(numeric) if criterion == MEAN_SQUARE else None
+    moments: Plain = {}
+    if network is not None:
+        moments = {
+            "verdict": str(network.verdict),
+            "stable": network.stable,
+            "notes": (*network.notes, "The modes are those of the nominal network."),
+        }
+        if network.mean_square_radius is not None:
+            moments |= {"measure": "growth factor of mean squares", "radius": network.mean_square_radius}
     values = np.array([mode.eigenvalue for mode in analysis.modes], dtype=np.complex128)
     return {
         "verdict": analysis.verdict + (", linearized" if analysis.linearized else ""),
         "stable": analysis.stable,
         "linear": not analysis.linearized,
-        "at_once": not analysis.linearized or prepare_at_start(system, prepared) is not None,
+        "at_once": not analysis.linearized or prepare_at_start(numeric) is not None,
+        "measure": "spectral radius",
         "radius": analysis.spectral_radius,
         "limits": _dominant_mode_text(analysis),
         "notes": analysis.limitations,
         "text": str(analysis),
         "real": values.real,
         "imag": values.imag,
-        "names": [_named(mode) for mode in analysis.modes],
+        "names": [_mode_text(mode) for mode in analysis.modes],
+        **moments,
     }
 
 
-def _named(mode: Mode) -> str:
-    at = f" at {in_hertz(mode.frequency_hz)}" if mode.frequency_hz > 0 else ""
-    return f"{mode.family}{at}"
+def _mode_text(mode: Mode) -> str:
+    """Return the text of a mode: its family and frequency."""
+    frequency_text = f" at {in_hertz(mode.frequency_hz)}" if mode.frequency_hz > 0 else ""
+    return f"{mode.family}{frequency_text}"
 
 
 def _dominant_mode_text(analysis: Analysis) -> str:
     """Return a sentence on the dominant mode: its growth or decay, and its largest participations."""
     if not analysis.modes:
-        return "Nothing moves."
+        return "The topology has no modes."
     dominant = analysis.modes[0]
     parts = sorted(dominant.participation, key=lambda pair: -pair[1])[:2]
     moves = " and ".join(name for name, _ in parts)
-    changes = "grows" if dominant.magnitude > 1 else "dies out most slowly"
+    changes = "grows" if dominant.magnitude > 1 else "decays most slowly"
     times = f"by {dominant.magnitude:.6g} each {analysis.frame_s * 1e3:.6g} ms"
-    return f"{_named(dominant)[0].upper()}{_named(dominant)[1:]} {changes}, {times}: mostly {moves}."
+    name = _mode_text(dominant)
+    return f"{name[0].upper()}{name[1:]} {changes}, {times}; largest participation: {moves}."
 
 
-def _region(system: Model, prepared: Prepared, requested: tuple[Range, Range, str]) -> Plain:
-    x, y, criterion = requested
-    result = region(system, (x, y), tolerance=PLOTTED, criterion=criterion, prepared=prepared)
+def _region(numeric: NumericModel, request: tuple[Range, Range, str]) -> Plain:
+    """Return the stable region of two parameters: outlines, boundary curves and share of the area."""
+    x, y, criterion = request
+    result = region(numeric, (x, y), tolerance=PLOTTED, criterion=criterion)
     return {
         "outlines": stable_outlines(result),
         "curves": [plotted_points(result, number) for number in range(len(result.curves))],
@@ -150,13 +162,14 @@ def _region(system: Model, prepared: Prepared, requested: tuple[Range, Range, st
     }
 
 
-def _roots(system: Model, prepared: Prepared, requested: tuple[ParameterRef, tuple[Fraction, ...]]) -> Plain:
-    """Return the eigenvalues at values of a slider."""
-    free, values = requested
-    slow = reaches_time(system, free) or reaches_count(system, free)
+def _roots(numeric: NumericModel, request: tuple[ParameterRef, tuple[Fraction, ...]]) -> Plain:
+    """Return the root locus: the eigenvalues at values of a slider."""
+    system = numeric.model
+    free, values = request
+    slow = kind_for_parameter(system, free) is not EvaluatorKind.MATRICES
     numbers = _thinned(values, FEW_ROOTS if slow else ROOTS)
     with finite_equations(system.name):
-        indices, rows = eigenvalues_at(system, free, numbers, prepared=prepared)
+        indices, rows = eigenvalues_at(numeric, free, numbers)
     result = np.concatenate([EMPTY, *rows])
     texts = [text_of(number, unit_of(system, free.name)) for number in numbers]
     return {
@@ -170,34 +183,37 @@ def _roots(system: Model, prepared: Prepared, requested: tuple[ParameterRef, tup
 
 
 def _thinned(values: Sequence[Fraction], most: int) -> list[Fraction]:
-    """Return at most `count` of the values, including the first and the last."""
+    """Return at most `most` of the values, equally spaced, with the first and the last."""
     indices = np.unique(np.linspace(0, len(values) - 1, min(most, len(values))).astype(int))
     return [values[index] for index in indices.tolist()]
 
 
-def _margins(system: Model, prepared: Prepared, _: None) -> Plain:
-    return {"text": str(margins(system, prepared=prepared, quick=True))}
+def _margins(numeric: NumericModel, _: None) -> Plain:
+    """Return the text of the stability margins."""
+    return {"text": str(margins(numeric, quick=True))}
 
 
-def _tune(system: Model, _: Prepared, requested: tuple[tuple[str, ...], str]) -> Plain:
-    """Return the best of the gains that the model's `studies: tune:` frees, or else of those asked for."""
-    free, best = requested
-    held, criterion = gripped_as_studied(system)
-    tuning_spec = read_tuning_spec(held, free, maximize=best, criterion=criterion)
-    return {"text": str(tune(held, tuning_spec))}
+def _tune(numeric: NumericModel, request: tuple[tuple[str, ...], str]) -> Plain:
+    """Return the text of the optimal gains.
+
+    The gains and the objective are those of the model's `studies: tune:`, or else those of the request.
+    """
+    free, objective = request
+    with_hands, criterion = gripped_as_studied(numeric.model)
+    tuning_spec = read_tuning_spec(with_hands, free, maximize=objective, criterion=criterion)
+    return {"text": str(tune(with_hands, tuning_spec))}
 
 
-def _motion(system: Model, _: Prepared, struck: bool) -> Plain:
-    return {"motion": motion_of(system, struck=struck)}
+def _motion(numeric: NumericModel, struck: bool) -> Plain:
+    """Return the simulated motion, with or without an impulse at the start."""
+    return {"motion": motion_of(numeric.model, struck=struck)}
 
 
-def _transparency(system: Model, prepared: Prepared, at: str) -> Plain:
-    """Return the transparency at a device (by default the first), and the other devices."""
-    frequencies = read_frequencies(system, None, LOWEST, None, FREQUENCIES)
-    names = gripped_names(system, prepared)
-    result = transparency(
-        system, frequencies, at=at or next(iter(names), ""), alongside=(), prepared=prepared
-    )
+def _transparency(numeric: NumericModel, at: str) -> Plain:
+    """Return the impedance at a device (by default the first), and the names of all devices."""
+    frequencies = read_frequencies(numeric.model, None, LOWEST, None, FREQUENCIES)
+    names = device_labels(numeric)
+    result = transparency(numeric, frequencies, at=at or next(iter(names), ""), alongside=())
     return {
         "names": names,
         "at": result.at,
@@ -208,16 +224,19 @@ def _transparency(system: Model, prepared: Prepared, at: str) -> Plain:
     }
 
 
-def _network(system: Model, prepared: Prepared, _: None) -> Plain:
-    """Return the verdict over the network, and the loss and the jitter of each link at which it changes."""
+def _network(numeric: NumericModel, _: None) -> Plain:
+    """Return the text of the verdict over the lossy network, and of the critical loss and jitter of
+    each link.
+    """
+    system = numeric.model
     links = [link for link in system.links if link.channel is not None]
     if not links:
         name = system.links[0].name if system.links else "lan"
-        message = "no link here loses packets or delays them by chance: there is nothing to look for"
-        write = f"To look, write in the topology: links: {{{name}: {{…, loss: 1 %, jitter: 1 ms}}}}"
+        message = "no link here loses packets or has random delays"
+        write = f"Write in the topology: links: {{{name}: {{…, loss: 1 %, jitter: 1 ms}}}}"
         raise ApcError(Diagnostic("E984", SourceLocation(system.name), f"{message}. {write}"))
-    verdict = mean_square_stability(system, prepared)
-    texts = ["Here packets are always on time." if verdict is None else str(verdict)]
+    verdict = mean_square_stability(numeric)
+    texts = ["Every packet is on time." if verdict is None else str(verdict)]
     for link in links:
         assert link.channel is not None
         loss, jitter = link.channel.loss, link.channel.jitter
@@ -227,22 +246,23 @@ def _network(system: Model, prepared: Prepared, _: None) -> Plain:
 
 
 def _critical(system: Model, name: str) -> str:
+    """Return the text of the critical values of a parameter, or of the reason if there are none."""
     try:
         return str(critical(system, name, criterion=MEAN_SQUARE))
     except ApcError as error:
         return f"{name}: {error.mistakes[0].reason}"
 
 
-def _numbers(system: Model, prepared: Prepared, requested: tuple[Range, Range, str] | None) -> Plain:
-    """Return the downloaded data: the analysis and the region in the form of `--json`."""
-    document = {"analyze": analyze(system, prepared=prepared).to_dict()}
-    if requested is not None:
-        x, y, criterion = requested
-        document["region"] = region(system, (x, y), criterion=criterion, prepared=prepared).to_dict()
+def _numbers(numeric: NumericModel, request: tuple[Range, Range, str] | None) -> Plain:
+    """Return the data for download: the analysis and the region, in the form of `--json`."""
+    document = {"analyze": analyze(numeric).to_dict()}
+    if request is not None:
+        x, y, criterion = request
+        document["region"] = region(numeric, (x, y), criterion=criterion).to_dict()
     return document
 
 
-SECTIONS: dict[str, Callable[[Model, Prepared, Any], Plain]] = {
+SECTIONS: dict[str, Callable[[NumericModel, Any], Plain]] = {
     "verdict": _verdict,
     "region": _region,
     "roots": _roots,

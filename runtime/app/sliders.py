@@ -13,6 +13,7 @@ from __future__ import annotations
 import sys
 from bisect import bisect_left
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from math import ceil, floor, lcm, log10
@@ -21,37 +22,45 @@ from typing import Any
 from apc.compiler.compiled import Model, group_count
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.wording import with_unit
-from apc.frame.display_units import as_shown
-from apc.frame.linearize import start_names
-from apc.frame.overrides import Override, parse_override
-from apc.frame.parameter_names import ParameterRef, Range, named_times, parameter_of, times_of, unit_of
-from apc.parameter_studies.evaluator import free_parameters
-from apc.parameter_studies.margins import STIFFNESSES, coupler_parameters
+from apc.lifting.numeric_model import numeric_model
+from apc.linearization.linearize import start_names
+from apc.parameter_values.display_units import as_shown
+from apc.parameter_values.overrides import Override, apply, parse_override
+from apc.parameter_values.parameter_names import (
+    ParameterRef,
+    Range,
+    named_times,
+    parameter_of,
+    times_of,
+    unit_of,
+)
+from apc.studies.evaluator import free_parameters
+from apc.studies.margins import STIFFNESSES, coupler_parameters, margins
 
-# Largest number of values of a slider: one per pixel of its length.
+# The largest number of values of a slider, about one per pixel of its length.
 STEPS = 200
-# The range of a positive parameter in decades to either side of its value; values per decade.
-DECADES, A_DECADE = 2, 48
+# The range of a positive parameter, in decades on both sides of its value; the number of values per decade.
+DECADES, PER_DECADE = 2, 48
 # Digits of a value on a logarithmic slider.
 DIGITS = 3
-# Frames of more ticks than this take longer than a slider may.
+# The largest number of ticks in a frame: longer frames are too slow for a slider.
 MOST_TICKS = 200
-# A clock's periods are these multiples and shares of the other clocks' periods.
+# The periods of a clock are multiples and fractions of the other clocks' periods, up to this factor.
 RATIOS = 16
-# Beyond the present value, as a share of it, a range goes on at least so far.
+# The smallest upper end of a range, relative to the present value.
 ROOM = Fraction(3)
-# Fewest and most peers of a group, beyond the present count.
+# The largest number of peers of a group, relative to the present count.
 COUNTS = 4
 
-PARAMETERS, TIMES, PEOPLE = "parameters", "delays and periods", "users"
+PARAMETERS, TIMES, PEER_COUNTS = "parameters", "delays and periods", "users"
 
 
 @dataclass(frozen=True, slots=True)
 class Slider:
     """A parameter with its ascending SI values and their texts; `start` is the index of the model's value.
 
-    `kind` is one of `PARAMETERS`, `TIMES` and `PEOPLE`; `span` is the range an axis of a region has, None
-    where it can't be one.
+    `kind` is one of `PARAMETERS`, `TIMES` and `PEER_COUNTS`; `span` is the range on an axis of a region, None
+    if the parameter cannot be on an axis.
     """
 
     free: ParameterRef
@@ -65,7 +74,7 @@ class Slider:
 
     @property
     def label(self) -> str:
-        """The name as `--set` takes it."""
+        """The name of the parameter for `--set`."""
         return self.free.label
 
 
@@ -75,103 +84,149 @@ def sliders_of(system: Model) -> tuple[Slider, ...]:
     Parameters
     ----------
     system
-        The model, with the numbers that the sliders begin with. What it studies comes first, then
-        its couplers' stiffnesses and dampings: the first two are the axes of the region.
+        The model, with the initial values of the sliders. The parameters of its studies come first, then
+        the stiffnesses and dampings of couplers: the first two are the axes of the region.
     """
     starts = start_names(system)
+    limits: dict[str, float] | None = None  # of stability, computed only for parameters without bounds
     studied = {axis.parameter: (axis.low, axis.high) for axis in system.region}
     sliders = []
-    for free in free_parameters(system):
-        parameter = parameter_of(system, free)
-        if free.name in starts and parameter.value == 0:
-            continue  # where nothing is said of a start, nobody looks for a slider of it
-        low, high = _bounds(system, free)
-        span = studied.get(free.label) or _span(system, free, parameter.number, low, high)
-        if parameter.value > 0 and parameter.unit != "1" and free.label not in studied:
-            values = _decades(parameter.number, low, high)
+    for parameter_ref in free_parameters(system):
+        parameter = parameter_of(system, parameter_ref)
+        if parameter_ref.name in starts and parameter.value == 0:
+            continue  # a start value of zero has no slider
+        low, high = _bounds(system, parameter_ref)
+        if low is None and high is None:
+            low = _inherited_minimum(system, parameter_ref)
+            limits = _stability_limits(system) if limits is None else limits
+            if parameter_ref.label in limits and parameter_ref.label not in studied:
+                studied[parameter_ref.label] = (
+                    low or Fraction(0),
+                    _rounded_up(2 * Fraction(limits[parameter_ref.label])),
+                )
+        span = studied.get(parameter_ref.label) or _default_range(
+            system, parameter_ref, parameter.number, low, high
+        )
+        if parameter.value > 0 and parameter.unit != "1" and parameter_ref.label not in studied:
+            values = _logarithmic_values(parameter.number, low, high)
         else:
-            values = _even(parameter.number, *_within(span, parameter.number), low, high)
+            values = _linear_values(parameter.number, *_extended(span, parameter.number), low, high)
         sliders.append(
-            _slider(system, free, PARAMETERS, parameter.description, values, parameter.number, span)
+            _slider(system, parameter_ref, PARAMETERS, parameter.description, values, parameter.number, span)
         )
     couplers = coupler_parameters(system)
     couplers.sort(key=lambda coupler: unit_of(system, coupler.name) not in STIFFNESSES)
-    listed = [*studied, *(coupler.label for coupler in couplers)]
-    sliders.sort(key=lambda slider: listed.index(slider.label) if slider.label in listed else len(listed))
-    return (*sliders, *_times(system, studied), *_people(system))
+    first_labels = [*studied, *(coupler.label for coupler in couplers)]
+    sliders.sort(
+        key=lambda slider: (
+            first_labels.index(slider.label) if slider.label in first_labels else len(first_labels)
+        )
+    )
+    return (*sliders, *_time_sliders(system, studied), *_peer_count_sliders(system))
 
 
 def _slider(
     system: Model,
-    free: ParameterRef,
+    parameter_ref: ParameterRef,
     kind: str,
     description: str,
     values: Iterable[Fraction],
     now: Fraction,
     span: tuple[Fraction, Fraction] | None,
 ) -> Slider:
-    unit = unit_of(system, free.name)
-    listed = tuple(sorted({*values, now}))
-    texts = tuple(text_of(number, unit) for number in listed)
-    return Slider(free, unit, kind, description, listed, texts, listed.index(now), span)
+    """Return the slider of a parameter with some values and its present value `now`."""
+    unit = unit_of(system, parameter_ref.name)
+    ascending = tuple(sorted({*values, now}))
+    texts = tuple(text_of(number, unit) for number in ascending)
+    return Slider(parameter_ref, unit, kind, description, ascending, texts, ascending.index(now), span)
 
 
 def text_of(value: Fraction, unit: str) -> str:
-    """Return a value as `--set` takes it, in the unit in which people are shown it."""
-    by, shown = as_shown(float(value), unit)
-    return with_unit(_digits(value * by), shown)
+    """Return the text of an SI value for `--set`, in the display unit."""
+    factor, display_unit = as_shown(float(value), unit)
+    return with_unit(_exact_text(value * factor), display_unit)
 
 
-def _digits(value: Fraction) -> str:
-    """Return a number as the language reads it: the same rational again."""
-    near = f"{float(value):.12g}"
-    return near if Fraction(near) == value else repr(float(value)) if _is_float(value) else str(value)
+def _exact_text(value: Fraction) -> str:
+    """Return the text of a number that represents exactly this number."""
+    rounded = f"{float(value):.12g}"
+    return rounded if Fraction(rounded) == value else repr(float(value)) if _is_float(value) else str(value)
 
 
 def _is_float(value: Fraction) -> bool:
+    """Return whether a number is the shortest decimal of a float."""
     return Fraction(repr(float(value))) == value
 
 
-def _bounds(system: Model, free: ParameterRef) -> tuple[Fraction | None, Fraction | None]:
-    """Return the least and the largest value a parameter may have; above an open bound, a little more."""
-    parameter = parameter_of(system, free)
+def _bounds(system: Model, parameter_ref: ParameterRef) -> tuple[Fraction | None, Fraction | None]:
+    """Return the smallest and the largest valid value of a parameter, None if unbounded.
+
+    At an open bound, the value is slightly above the bound.
+    """
+    parameter = parameter_of(system, parameter_ref)
     low = None if parameter.minimum is None else Fraction(repr(parameter.minimum))
     if low is not None and parameter.exclusive_minimum:
         low += abs(parameter.number - low) / 10**DECADES
     return low, None if parameter.maximum is None else Fraction(repr(parameter.maximum))
 
 
-def _span(
-    system: Model, free: ParameterRef, now: Fraction, low: Fraction | None, high: Fraction | None
+def _inherited_minimum(system: Model, parameter_ref: ParameterRef) -> Fraction | None:
+    """Return the smallest value of a parameter that the bounds of its dependent parameters permit.
+
+    It is None without such a bound, 0, or slightly above 0 where 0 is not permitted.
+    """
+    size = abs(parameter_of(system, parameter_ref).number) or Fraction(1)
+    for value in (-size, Fraction(0), size / 10**DECADES):
+        with suppress(ApcError):
+            apply(system, [Override(parameter_ref, value)])
+            return None if value < 0 else value
+    return None
+
+
+def _stability_limits(system: Model) -> dict[str, float]:
+    """Return the parameters whose upper stability limit is found quickly, with the limit."""
+    with suppress(ApcError):
+        rows = margins(numeric_model(system), quick=True).rows
+        return {row.parameter: row.value for row in rows if row.value is not None and row.value > row.current}
+    return {}
+
+
+def _default_range(
+    system: Model, parameter_ref: ParameterRef, now: Fraction, low: Fraction | None, high: Fraction | None
 ) -> tuple[Fraction, Fraction]:
-    """Return a range around a value: all that it may be, or to `ROOM` times it, below 0 too if it may."""
+    """Return a range around a value: between the bounds, or up to `ROOM` times the value, and below 0
+    if valid.
+    """
     if low is not None and high is not None:
         return low, high
-    interchangeable = [
+    same_unit = [
         abs(parameter.number)
         for parameter in system.parameters
-        if parameter.unit == unit_of(system, free.name)
+        if parameter.unit == unit_of(system, parameter_ref.name)
     ]
-    size = abs(now) or max(interchangeable, default=Fraction(0)) or Fraction(1)
+    size = abs(now) or max(same_unit, default=Fraction(0)) or Fraction(1)
     least = -ROOM * size if low is None else low
-    most = _nice(ROOM * size)
+    most = _rounded_up(ROOM * size)
     return least, min(most, high) if high is not None else most
 
 
-def _within(span: tuple[Fraction, Fraction], value: Fraction) -> tuple[Fraction, Fraction]:
+def _extended(span: tuple[Fraction, Fraction], value: Fraction) -> tuple[Fraction, Fraction]:
+    """Return a range, extended if necessary to contain a value."""
     return min(span[0], value), max(span[1], value)
 
 
-def _nice(value: Fraction) -> Fraction:
+def _rounded_up(value: Fraction) -> Fraction:
     """Return a positive number rounded up to two digits."""
     unit = Fraction(10) ** (floor(log10(float(value))) - 1)
     return ceil(value / unit) * unit
 
 
-def _even(
+def _linear_values(
     now: Fraction, least: Fraction, most: Fraction, low: Fraction | None, high: Fraction | None
 ) -> list[Fraction]:
-    """Return values in even steps of a round size."""
+    """Return values from `least` to `most` in equal steps of a round size, within the bounds, and the
+    present value.
+    """
     exact = (most - least) / STEPS
     power = Fraction(10) ** floor(log10(float(exact)))
     step = next(power * number for number in (1, 2, 5, 10) if power * number >= exact)
@@ -184,25 +239,25 @@ def _even(
     return [*values, *ends, now]
 
 
-def _decades(now: Fraction, low: Fraction | None, high: Fraction | None) -> list[Fraction]:
-    """Return values of few digits, even on a logarithmic scale."""
+def _logarithmic_values(now: Fraction, low: Fraction | None, high: Fraction | None) -> list[Fraction]:
+    """Return values of few digits with equal steps on a logarithmic scale, within the bounds."""
     middle = log10(float(now))
-    count = DECADES * A_DECADE
-    listed = [Fraction(f"{10 ** (middle + k / A_DECADE):.{DIGITS}g}") for k in range(-count, count + 1)]
+    count = DECADES * PER_DECADE
+    values = [Fraction(f"{10 ** (middle + k / PER_DECADE):.{DIGITS}g}") for k in range(-count, count + 1)]
     return [
-        number for number in listed if (low is None or number >= low) and (high is None or number <= high)
+        number for number in values if (low is None or number >= low) and (high is None or number <= high)
     ]
 
 
-def _times(system: Model, studied: dict[str, tuple[Fraction, Fraction]]) -> list[Slider]:
-    """Return the sliders of delays, phases and periods that follow from nothing."""
+def _time_sliders(system: Model, studied: dict[str, tuple[Fraction, Fraction]]) -> list[Slider]:
+    """Return the sliders of delays, phases and periods without formula."""
     periods = {clock.period: clock for clock in system.clocks}
     phases = {clock.phase: clock for clock in system.clocks}
     now = {timing.name: timing.value for timing in system.timings}
     longest = max((now[name] for name in periods), default=Fraction(1))
     sliders = []
     for timing in named_times(system):
-        free, value = ParameterRef(timing.name), timing.value
+        parameter_ref, value = ParameterRef(timing.name), timing.value
         if timing.formula is not None:
             continue
         span = None
@@ -215,14 +270,15 @@ def _times(system: Model, studied: dict[str, tuple[Fraction, Fraction]]) -> list
             period = now[phases[timing.name].period]
             description, values = "of the first tick", [period * k / 20 for k in range(20)]
         else:
-            description = _about(system, timing.name)
-            span = studied.get(timing.name, (Fraction(0), _nice(max(ROOM * value, 4 * longest))))
-            values = _even(value, *_within(span, value), Fraction(0), None)
-        sliders.append(_slider(system, free, TIMES, description, values, value, span))
+            description = _time_description(system, timing.name)
+            span = studied.get(timing.name, (Fraction(0), _rounded_up(max(ROOM * value, 4 * longest))))
+            values = _linear_values(value, *_extended(span, value), Fraction(0), None)
+        sliders.append(_slider(system, parameter_ref, TIMES, description, values, value, span))
     return sorted(sliders, key=lambda slider: (slider.span is None, slider.free.name in phases))
 
 
-def _about(system: Model, name: str) -> str:
+def _time_description(system: Model, name: str) -> str:
+    """Return the description of a time."""
     description = next(
         (parameter.description for parameter in system.parameters if parameter.name == name), ""
     )
@@ -230,30 +286,30 @@ def _about(system: Model, name: str) -> str:
 
 
 def _periods(now: Fraction, others: Sequence[Fraction]) -> list[Fraction]:
-    """Return periods with which frames stay short: multiples and shares of the other clocks'."""
+    """Return periods of a clock with short frames: multiples and fractions of the other clocks' periods."""
     if not others:
-        return _decades(now, None, None)
-    listed = {other * k for other in others for k in range(1, RATIOS + 1)}
-    listed |= {other / k for other in others for k in range(1, RATIOS + 1)}
+        return _logarithmic_values(now, None, None)
+    candidates = {other * k for other in others for k in range(1, RATIOS + 1)}
+    candidates |= {other / k for other in others for k in range(1, RATIOS + 1)}
     return [
         number
-        for number in listed
+        for number in candidates
         if now / 10 <= number <= now * 10 and _frame([number, *others]) / min(number, *others) <= MOST_TICKS
     ]
 
 
 def _frame(periods: Sequence[Fraction]) -> Fraction:
     """Return the least common multiple of periods."""
-    below = lcm(*(period.denominator for period in periods))
-    return Fraction(lcm(*(int(period * below) for period in periods)), below)
+    denominator = lcm(*(period.denominator for period in periods))
+    return Fraction(lcm(*(int(period * denominator) for period in periods)), denominator)
 
 
-def _people(system: Model) -> list[Slider]:
-    """Return the sliders of the numbers of peers of groups without individual peer values."""
+def _peer_count_sliders(system: Model) -> list[Slider]:
+    """Return the sliders of the numbers of peers, of groups without individual values for each peer."""
     sliders = []
     for group in system.groups:
-        free = ParameterRef(group_count(group.name))
-        parameter = parameter_of(system, free)
+        parameter_ref = ParameterRef(group_count(group.name))
+        parameter = parameter_of(system, parameter_ref)
         if group.columns or parameter.formula is not None:
             continue
         least = 2 if len(system.groups) == 1 else 1
@@ -261,14 +317,16 @@ def _people(system: Model) -> list[Slider]:
         values = [Fraction(k) for k in range(least, most + 1)]
         span = (Fraction(least), Fraction(most))
         description = f"how many peers {group.name} has"
-        sliders.append(_slider(system, free, PEOPLE, description, values, Fraction(group.count), span))
+        sliders.append(
+            _slider(system, parameter_ref, PEER_COUNTS, description, values, Fraction(group.count), span)
+        )
     return sliders
 
 
 def is_number(value: Any) -> bool:
     """Return whether a value from the browser is a finite number."""
-    whole = isinstance(value, int | float) and not isinstance(value, bool)
-    return whole and abs(value) <= sys.float_info.max  # an int may be larger
+    is_real = isinstance(value, int | float) and not isinstance(value, bool)
+    return is_real and abs(value) <= sys.float_info.max  # an int may exceed the range of floats
 
 
 def is_position(slider: Slider, value: Any) -> bool:
@@ -282,19 +340,19 @@ def is_member_of(names: Iterable[str], value: Any) -> bool:
 
 
 def position_of(slider: Slider, value: Fraction | float) -> int:
-    """Return the place of the value of a slider that is nearest."""
+    """Return the index of the nearest value of a slider."""
     after = bisect_left(slider.values, value)
     indices = [number for number in (after - 1, after) if 0 <= number < len(slider.values)]
     return min(indices, key=lambda index: abs(slider.values[index] - Fraction(value)))
 
 
 def set_to(system: Model, sliders: Sequence[Slider], text: str) -> tuple[int, Fraction]:
-    """Return the slider that `NAME=QUANTITY` sets, and the value.
+    """Return the index of the slider for a setting `NAME=QUANTITY`, and the value.
 
     Raises
     ------
     ApcError
-        E980 what is set has no slider; and those of `overrides.parse_override`.
+        E980 the parameter has no slider; and the errors of `overrides.parse_override`.
     """
     override = parse_override(system, text)
     for index, slider in enumerate(sliders):
@@ -307,11 +365,11 @@ def set_to(system: Model, sliders: Sequence[Slider], text: str) -> tuple[int, Fr
 
 
 def with_value(slider: Slider, value: Fraction) -> tuple[Slider, int]:
-    """Return a slider that has a value, and the value's place; it begins where it did."""
-    listed = tuple(sorted({*slider.values, value}))
-    texts = tuple(text_of(number, slider.unit) for number in listed)
-    start = listed.index(slider.values[slider.start])
-    return replace(slider, values=listed, texts=texts, start=start), listed.index(value)
+    """Return a slider with an additional value, and the index of the value; the start value is the same."""
+    values = tuple(sorted({*slider.values, value}))
+    texts = tuple(text_of(number, slider.unit) for number in values)
+    start = values.index(slider.values[slider.start])
+    return replace(slider, values=values, texts=texts, start=start), values.index(value)
 
 
 def overrides_of(sliders: Sequence[Slider], indices: Sequence[int]) -> list[Override]:
@@ -326,14 +384,14 @@ def overrides_of(sliders: Sequence[Slider], indices: Sequence[int]) -> list[Over
 def axes_of(
     sliders: Sequence[Slider], indices: Sequence[int], chosen: tuple[int, int]
 ) -> tuple[Range, Range]:
-    """Return the axes of a region over two sliders: their spans, wide enough for their values."""
+    """Return the axes of a region over two sliders: their ranges, extended to contain their values."""
     intervals = []
     for number in chosen:
         slider, value = sliders[number], sliders[number].values[indices[number]]
         assert slider.span is not None
         low, high = slider.span
-        room = (high - low) / 10
-        low = low if value >= low else value - room
-        high = high if value <= high else _nice(value + room)
+        margin = (high - low) / 10
+        low = low if value >= low else value - margin
+        high = high if value <= high else _rounded_up(value + margin)
         intervals.append(Range(slider.free, slider.unit, low, high))
     return intervals[0], intervals[1]

@@ -1,10 +1,10 @@
-"""The hard cases: topologies whose truth is known to fifty digits, each analysed and compared with it.
+"""The hard cases: topologies with a reference of fifty digits, compared with their analyses.
 
 Takes: a folder of topologies and its `truths.json`.
 Gives: `HardCase`, `HardReport`, `run_hard_cases`.
-Guarantees: an error is computed exactly from the stored digits; a bound that does not hold or says nothing, a
-verdict that is wrong or left open and a wrong number of rigid modes fail.
-Does not: compute any truth (see the script beside the topologies).
+Guarantees: an error is computed exactly from the stored digits; a violated or infinite bound, a wrong or
+undecided verdict and a wrong number of rigid modes are failures.
+Does not: compute references (see the script in the folder of the topologies).
 """
 
 from __future__ import annotations
@@ -18,7 +18,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from apc.analysis.analysis import Analysis, analyze
+from apc.analysis.analysis import Analysis
+from apc.benchmark.speed_and_error import analysis_of
 from apc.benchmark.timing import median_time
 from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
@@ -26,23 +27,23 @@ from apc.compiler.files import RefusedError, read_file
 from apc.compiler.pipeline import compile_topology
 from apc.compiler.source.nodes import MAX_BYTES
 from apc.result import Result
-from apc.threads import single_threaded
+from apc.support.threads import single_threaded
 from apc.verdict import StabilityVerdict
 
 TRUTHS = "truths.json"
-FOLDER = "--hard FOLDER, of topologies and their truths, as tests/hard of a copy of the repository"
-REPEATS = 3  # of each analysis; its time is the median
-ENOUGH = 2.0  # seconds after which one is not repeated
+FOLDER = "--hard tests/hard"
+REPEATS = 3  # runs of each analysis, of which the median time is used
+ENOUGH = 2.0  # seconds after which an analysis is not repeated
 
 
 @dataclass(frozen=True, slots=True)
 class HardCase:
-    """One topology: the answer beside the truth.
+    """One topology: the analysis compared with the reference.
 
-    `error` is |ρ − truth|, `bound` the error bound of the analysis, both divided by max(ρ, 1) where ρ
-    is the truth. `seconds` is the median time of the analysis. `undecided` says that it left the verdict
-    open. `failed` is the failure, "" if none: no bound and no verdict are failures too, since the
-    truth is known.
+    `error` is |ρ − reference|, `bound` the error bound of the analysis, both divided by max(ρ, 1) of the
+    reference. `seconds` is the median time of the analysis. `undecided` is whether the verdict is undecided.
+    `failed` is the text of the failure, "" if none: no bound and no verdict are failures too, since the
+    reference is known.
     """
 
     name: str
@@ -59,18 +60,18 @@ class HardCase:
 
     @property
     def looseness(self) -> float:
-        """Bound ÷ error; infinite where there is no error."""
+        """The ratio of bound to error, infinite for an error of zero."""
         return self.bound / self.error if self.error else math.inf
 
     @property
     def unbounded(self) -> bool:
-        """Whether the bound says nothing."""
+        """Whether the bound is infinite."""
         return not math.isfinite(self.bound)
 
 
 @dataclass(frozen=True, slots=True)
 class HardReport(Result):
-    """All cases of a folder, and its topologies without a truth."""
+    """All cases of a folder; `without` are its topologies without a reference."""
 
     shown_by = "bench_output:hard"
 
@@ -88,25 +89,25 @@ def run_hard_cases(
     folder: Path,
     *,
     repeats: int = REPEATS,
-    solve: Callable[[Model], Analysis] = analyze,
+    solve: Callable[[Model], Analysis] = analysis_of,
 ) -> HardReport:
-    """Analyse every topology of a folder and compare.
+    """Return the comparison of the analyses of all topologies in a folder with their references.
 
     Parameters
     ----------
     folder
-        Holds topologies and `truths.json`: by the name of a file without its suffix, `spectral_radius` (text,
-        many digits), `rigid_modes`, `verdict`.
+        A folder with topologies and `truths.json`, which has by file name without suffix `spectral_radius`
+        (text, many digits), `rigid_modes`, `verdict`.
     repeats
-        Analyses of each topology, of which the median time counts.
+        The number of analyses of each topology, of which the median time is used.
     solve
-        The analysis.
+        The function that analyzes a model.
 
     Raises
     ------
     ApcError
-        E920 no such folder, no truths in it or truths that can't be read; and those of compiling and
-        analysing.
+        E920 the folder or its references are missing or invalid; and the errors of compilation and
+        analysis.
     """
     truths = _truths(folder)
     cases, without = [], []
@@ -119,15 +120,15 @@ def run_hard_cases(
             seconds, result = median_time(partial(solve, system), repeats, enough=ENOUGH)
         cases.append(compare(system, result, truths[path.stem], seconds, path.stem))
     if not cases:
-        message = "holds no topology whose truth is known"
-        raise ApcError(Diagnostic("E920", SourceLocation(str(folder)), message, hint=FOLDER))
+        message = "has no topology with a reference result"
+        raise ApcError(Diagnostic("E920", SourceLocation(str(folder)), message, fix=FOLDER))
     return HardReport(str(folder), tuple(cases), tuple(without))
 
 
 def compare(
     system: Model, analysis: Analysis, truth: Mapping[str, Any], seconds: float, name: str
 ) -> HardCase:
-    """Compare an analysis with the truth.
+    """Return the comparison of an analysis with its reference.
 
     Parameters
     ----------
@@ -136,29 +137,29 @@ def compare(
     truth
         An entry of `truths.json`.
     seconds
-        What it took.
+        The time of the analysis.
     name
         The name of the case.
     """
     radius = Fraction(truth["spectral_radius"])
     bound = analysis.spectral_radius_error
-    separation = None
+    deviation = None
     if math.isfinite(analysis.spectral_radius):
-        separation = abs(Fraction(analysis.spectral_radius) - radius)
+        deviation = abs(Fraction(analysis.spectral_radius) - radius)
     size = float(max(radius, Fraction(1)))
-    wrong = []
-    if separation is None:
-        wrong.append("there is no spectral radius")
+    failures = []
+    if deviation is None:
+        failures.append("no spectral radius")
     elif not math.isfinite(bound):
-        wrong.append("the bound says nothing")
-    elif separation > Fraction(bound):
-        wrong.append("the bound does not hold")
+        failures.append("the bound is infinite")
+    elif deviation > Fraction(bound):
+        failures.append("the bound does not hold")
     if analysis.stable is None:
-        wrong.append(f"the verdict is left open: {truth['verdict']}")
+        failures.append(f"the verdict is undecided; expected: {truth['verdict']}")
     elif analysis.verdict != truth["verdict"]:
-        wrong.append(f"the verdict is wrong: {truth['verdict']}")
+        failures.append(f"the verdict is wrong: {truth['verdict']}")
     if analysis.rigid_modes != truth["rigid_modes"]:
-        wrong.append(f"{truth['rigid_modes']} rigid modes, not {analysis.rigid_modes}")
+        failures.append(f"{truth['rigid_modes']} rigid modes, not {analysis.rigid_modes}")
     return HardCase(
         name=name,
         description=system.description,
@@ -166,34 +167,37 @@ def compare(
         method=analysis.method + (" + proof" if analysis.proof else ""),
         verdict=analysis.verdict,
         radius=str(truth["spectral_radius"]),
-        error=math.inf if separation is None else float(separation) / size,
+        error=math.inf if deviation is None else float(deviation) / size,
         bound=bound / size,
         seconds=seconds,
         undecided=analysis.stable is None,
-        failed="; ".join(wrong),
+        failed="; ".join(failures),
     )
 
 
 def _truths(folder: Path) -> dict[str, Any]:
-    """Read the truths of a folder."""
+    """Return the references of a folder by file name.
+
+    Raises ApcError (E920) for missing or invalid references.
+    """
     path = folder / TRUTHS
     location = SourceLocation(str(path))
     try:
         result = json.loads(read_file(path, MAX_BYTES))
     except RefusedError as refused:
-        raise ApcError(Diagnostic("E920", location, refused.words, hint=FOLDER)) from None
+        raise ApcError(Diagnostic("E920", location, refused.words, fix=FOLDER)) from None
     except ValueError as error:
-        raise ApcError(Diagnostic("E920", location, f"is not JSON: {error}")) from error
+        raise ApcError(Diagnostic("E920", location, f"invalid JSON: {error}")) from error
     pairs: list[tuple[str, Any]] = list(result.items()) if isinstance(result, dict) else [("", None)]
     for name, truth in pairs:
         try:
             Fraction(truth["spectral_radius"])
-            whole = isinstance(truth["rigid_modes"], int) and isinstance(truth["verdict"], str)
-            if not whole:
+            is_valid = isinstance(truth["rigid_modes"], int) and isinstance(truth["verdict"], str)
+            if not is_valid:
                 raise TypeError
         except (TypeError, KeyError, ValueError, ArithmeticError) as error:
             expected = "spectral_radius (digits), rigid_modes and verdict of each topology"
             raise ApcError(
-                Diagnostic("E920", location, name or "the truths", expected, "something else")
+                Diagnostic("E920", location, name or "reference results", expected, "something else")
             ) from error
     return dict(result)

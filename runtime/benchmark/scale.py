@@ -2,8 +2,8 @@
 
 Takes: a topology file and the numbers of peers.
 Gives: `Scale`, `ScaleRow`, `scale`.
-Guarantees: each number is measured in a process of its own, so that memory is its own.
-Does not: change the file; the group with the most peers of a written `count` grows in memory only.
+Guarantees: each number of peers is measured in a separate process, so that its memory is measured separately.
+Does not: change the file: the count of the largest group with a written `count` is changed in memory only.
 """
 
 from __future__ import annotations
@@ -17,8 +17,7 @@ from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
-from apc.analysis.analysis import analyze
-from apc.benchmark.speed_and_error import reason_of
+from apc.benchmark.speed_and_error import analysis_of, reason_of
 from apc.benchmark.timing import median_time, timed
 from apc.benchmark.truth import spectral_truth
 from apc.compiler.compiled import LARGEST_COUNT, Model
@@ -27,21 +26,23 @@ from apc.compiler.pipeline import stages_of
 from apc.compiler.source.nodes import Mapping, Scalar
 from apc.compiler.source.source import parse_source, read_source
 from apc.compiler.wording import counted
-from apc.not_supported import NotSupportedError
-from apc.processes import Patience, local_processes, results
 from apc.result import Result
+from apc.support.not_supported import NotSupportedError
+from apc.support.processes import Patience, local_processes, results
 from apc.verdict import StabilityVerdict
 
-Found = TypeVar("Found")
+Measured = TypeVar("Measured")
 
-REPEATS = 3  # of each analysis; its time is the median
+REPEATS = 3  # runs of each analysis, of which the median time is used
 
 
 @dataclass(frozen=True, slots=True)
 class ScaleRow:
-    """One number of peers: seconds to compile and analyse, bytes at most, the error of the radius.
+    """The measurement for one number of peers: seconds of compilation and analysis, largest memory in
+    bytes, error.
 
-    `count` is of the group that grows, `peers` of the whole topology.
+    `count` is the number of peers of the varied group, `peers` of the topology; `error` and `bound` are of
+    the spectral radius.
     """
 
     count: int
@@ -57,9 +58,9 @@ class ScaleRow:
 
 @dataclass(frozen=True, slots=True)
 class Scale(Result):
-    """A row a number; `refused` are the numbers that can't be analysed, with the reason.
+    """One row for each number of peers; `refused` are the numbers that can't be analyzed, with the reason.
 
-    `floor` says how much memory the program takes by itself.
+    `floor` is the text for the memory of the program itself.
     """
 
     shown_by = "bench_output:scale"
@@ -72,25 +73,25 @@ class Scale(Result):
 
 
 def scale(path: Path, counts: Sequence[int]) -> Scale:
-    """Compile and analyse a topology with other numbers of peers.
+    """Return time, memory and error of a topology with other numbers of peers.
 
     Parameters
     ----------
     path
         The topology.
     counts
-        How many peers the group that grows has; each is measured once.
+        The numbers of peers of the varied group; each is measured once.
 
     Raises
     ------
     ApcError
-        E921 no group has a written count, a number is none, or none of them can be analysed; and those of
-        compiling.
+        E921 no group has a written count, a number is invalid, or none can be analyzed; and the errors of
+        compilation.
     """
     if not counts or min(counts) < 1 or max(counts) > LARGEST_COUNT:
-        expected = f"numbers from 1 to {LARGEST_COUNT:,}, like 3,30,300"
+        expected = f"numbers from 1 to {LARGEST_COUNT:,}, such as 3,30,300"
         got = ",".join(map(str, counts))[:80]
-        raise ApcError(Diagnostic("E921", SourceLocation("--scale"), "the list", expected, got))
+        raise ApcError(Diagnostic("E921", SourceLocation("--scale"), "list", expected, got))
     name, _ = _largest(path)
     rows, refused = [], []
     floor = _measure_in_process(_floor, path, 0)
@@ -101,14 +102,14 @@ def scale(path: Path, counts: Sequence[int]) -> Scale:
             refused.append((count, reason_of(error)))
     if not rows:
         count, reason = refused[0]
-        message = f"leaves nothing to measure: {counted(count, 'peer')} of {name}: {reason}"
+        message = f"{counted(count, 'peer')} of {name} can't be measured: {reason}"
         raise ApcError(Diagnostic("E921", SourceLocation("--scale"), message))
-    text = f"{floor / 2**20:.0f} MiB are the program itself"
+    text = f"including {floor / 2**20:.0f} MiB of the program itself"
     return Scale(path.stem, name, tuple(rows), tuple(refused), text)
 
 
 def with_count(path: Path, count: int) -> Model:
-    """Compile a topology whose largest group has another number of peers."""
+    """Return the model of a topology whose largest group has another number of peers."""
     source = read_source(path)
     _, number = _largest(path)
     lines = source.text.splitlines(keepends=True)
@@ -125,7 +126,7 @@ def with_count(path: Path, count: int) -> Model:
 
 
 def _largest(path: Path) -> tuple[str, Scalar]:
-    """Return the group with the most peers of a written count, and where that stands."""
+    """Return the largest group with a written count, and the node of the count. Raises ApcError (E921)."""
     root = read_source(path).root
     groups = root.get("peers") if isinstance(root, Mapping) else None
     result: list[tuple[int, str, Scalar]] = []
@@ -134,26 +135,26 @@ def _largest(path: Path) -> tuple[str, Scalar]:
         if isinstance(number, Scalar) and isinstance(number.value, int):
             result.append((number.value, key.text, number))
     if not result:
-        message = "no group of this topology has a count that could grow"
+        message = "no group of this topology has a count that can be varied"
         raise ApcError(
-            Diagnostic("E921", SourceLocation(str(path)), message, hint="peers: {user: {count: 3}}")
+            Diagnostic("E921", SourceLocation(str(path)), message, fix="peers: {user: {count: 3}}")
         )
     _, name, number = max(result, key=lambda item: item[0])
     return name, number
 
 
-def _measure_in_process(measure: Callable[[Path, int], Found], path: Path, count: int) -> Found:
-    """Measure in a process of its own."""
+def _measure_in_process(measure: Callable[[Path, int], Measured], path: Path, count: int) -> Measured:
+    """Return the result of a measurement in a separate process."""
     location = SourceLocation("--scale")
-    message = "the process that measured it ended without a word: stopped from outside, or out of memory"
+    message = "the measuring process exited unexpectedly: stopped, or out of memory"
     with local_processes(measure, path, 1, Diagnostic("E921", location, message)) as workers:
         return next(results(workers, [count], Patience(), location))
 
 
 def _measure(path: Path, count: int) -> ScaleRow:
-    """Compile and analyse, in this process."""
+    """Return the measurement of compilation and analysis for one number of peers, in this process."""
     compiled, system = timed(partial(with_count, path, count))
-    analyzed, result = median_time(partial(analyze, system), REPEATS)
+    analyzed, result = median_time(partial(analysis_of, system), REPEATS)
     memory = _memory()
     error = None
     with suppress(NotSupportedError):
@@ -172,10 +173,11 @@ def _measure(path: Path, count: int) -> ScaleRow:
 
 
 def _floor(_path: Path, _count: int) -> int:
+    """Return the memory of a process without a model, in bytes."""
     return _memory()
 
 
 def _memory() -> int:
-    """Return the most bytes this process has held."""
+    """Return the largest memory of this process so far, in bytes."""
     most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return most if sys.platform == "darwin" else most * 1024

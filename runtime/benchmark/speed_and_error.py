@@ -1,10 +1,11 @@
-"""Speed against error: every method on one topology, on this machine, beside the truth.
+"""Time and error of every method on one topology, on this machine.
 
 Takes: a `Model`.
-Gives: `MethodTiming`, `TaskComparison`, `Bench`, `bench`; `pareto_front`; `reason_of`.
-Guarantees: times are the processor's, medians over rounds in which all methods take turns; an error is the
-distance from the same equations in balls (of a spectral radius) or from the exact transition (of a motion,
-whose own error is what one rounding of every coefficient makes), and is left out where there is none.
+Gives: `MethodTiming`, `TaskComparison`, `Bench`, `bench`; `pareto_front`; `reason_of`; `analysis_of`.
+Guarantees: times are processor times, medians over rounds in which all methods alternate; an error is the
+distance from the solution of the same equations in balls (spectral radius) or by the exact transition
+(motion, with the effect of one rounding of every coefficient as its own error); it is omitted without a
+reference.
 Does not: draw (see `output.bench_output`), or grow the topology (see `benchmark.scale`).
 """
 
@@ -24,34 +25,35 @@ from numpy.typing import NDArray
 
 from apc.analysis.analysis import Analysis, analyze
 from apc.analysis.methods import AUTO, METHODS, PAPER
-from apc.analysis.paper_method import analyze_paper
 from apc.benchmark.timing import alternate, spread_of, timed
 from apc.benchmark.truth import spectral_truth
 from apc.compiler.compiled import Model, PeerColumn
 from apc.compiler.errors import ApcError
 from apc.compiler.wording import with_unit
-from apc.distribution import versions
-from apc.frame.interval_arithmetic import UNIT_ROUNDOFF
-from apc.frame.jacobians import jacobians
-from apc.frame.parameters import resolve
-from apc.not_supported import NotSupportedError
+from apc.lifting.interval_arithmetic import UNIT_ROUNDOFF
+from apc.lifting.numeric_model import numeric_model
+from apc.linearization.jacobians import jacobians
+from apc.parameter_values.parameters import resolve
 from apc.result import Result
 from apc.simulation.flow import state_scales
 from apc.simulation.output_blocks import blocks
 from apc.simulation.settings import CVODES, DEFAULT, EXACT, RK4, SEMI_IMPLICIT, Method, Settings, finer
 from apc.simulation.simulation import Simulation, prepare
-from apc.threads import single_threaded
+from apc.support.distribution import versions
+from apc.support.extension_table import find_extension
+from apc.support.not_supported import NotSupportedError
+from apc.support.threads import single_threaded
 from apc.verdict import Limitation, LimitationCode, Note, code_of
 
 Floats = NDArray[np.float64]
 
-# Rounds in which every method takes its turn; a method gets fewer once its runs took so many seconds, and
-# none after its first run if that alone did.
+# The number of rounds with a run of every method, and the seconds after which a method has fewer runs: one
+# run only if the first run takes longer.
 ROUNDS, ENOUGH = 15, 3.0
 
-# Errors below this count as equal: their order is random. An eigenvalue of n states is computed to some n
-# roundings, a state after so many ticks to about as many as the root of their number; topologies have tens of
-# states and hundreds of ticks.
+# Errors below this are considered equal: their order is random. The error of an eigenvalue of n states is
+# about n roundings, of a state after k ticks about √k roundings; topologies have tens of states and hundreds
+# of ticks.
 SAME = 64 * UNIT_ROUNDOFF
 
 # Duration of the simulation: longer than any start-up.
@@ -60,17 +62,19 @@ DURATION = Fraction(1, 4)
 # Limitations that no method may have.
 WRONG = {LimitationCode.WRONG_VERDICT, LimitationCode.OPEN_VERDICT, LimitationCode.WRONG_BOUND}
 
-# Of `analyze(method=…)`, and the two that are called otherwise.
+# The methods of `analyze(method=…)`, and two methods with their own calls.
 CERTIFIED = "certified"
 ANALYSES = (*(text for text in METHODS if text not in (AUTO, PAPER)), CERTIFIED, PAPER)
 
 
 @dataclass(frozen=True, slots=True)
 class MethodTiming:
-    """One method: median `seconds`, `spread` (half the distance between the quartiles), over `rounds` runs.
+    """The measurement of one method: median `seconds`, and `spread` (half the interquartile range), over
+    `rounds` runs.
 
-    `error` is the true one, None without a reference; `bound` what the method itself says, None if it says
-    nothing. `front` says that no other method is both faster and more right; `chosen` that it is the default.
+    `error` is the true error, None without a reference; `bound` is the method's error bound, None if there is
+    none. `front` is whether no other method is both faster and more accurate; `chosen` whether it is the
+    default.
     """
 
     name: str
@@ -90,11 +94,12 @@ class MethodTiming:
 
 @dataclass(frozen=True, slots=True)
 class TaskComparison:
-    """All methods of one task, the fastest first.
+    """All methods for one task, sorted by time.
 
-    `quantity` is the quantity with an error, `relative` the reference of that error, `timed` the measured
-    operation. `reference` describes the true value, or the reason why there is none; `refused` are the
-    methods that do not support the topology, with the reason; `limitations` are those of all methods.
+    `quantity` is the quantity with an error, `relative` the reference value of the error, `timed` the
+    measured operation. `reference` describes the reference solution, or the reason why there is none;
+    `refused` are the methods that do not support the topology, with the reason; `limitations` are those of
+    all methods.
     """
 
     task: str
@@ -114,7 +119,7 @@ class TaskComparison:
 
     @property
     def faults(self) -> tuple[str, ...]:
-        """The failures: a wrong verdict or bound, or a method that crashes."""
+        """The texts of failures: a wrong verdict or bound, or a method that crashes."""
         wrong = [note for note in self.notes if code_of(note) in WRONG]
         crashed = [pair for pair in self.refused if code_of(pair[1]) is LimitationCode.CRASHED]
         return (*map(str, wrong), *(f"{name} {reason}" for name, reason in crashed))
@@ -122,7 +127,7 @@ class TaskComparison:
 
 @dataclass(frozen=True, slots=True)
 class Bench(Result):
-    """Both tasks on a topology; `machine` says where."""
+    """The measurements of both tasks on a topology; `machine` describes the machine."""
 
     shown_by = "bench_output:bench"
 
@@ -133,43 +138,45 @@ class Bench(Result):
 
     @property
     def faults(self) -> tuple[str, ...]:
-        """The failures on all topologies, empty if there are none."""
+        """The texts of failures of both tasks, empty if there are none."""
         return tuple(fault for comparison in self.comparisons for fault in comparison.faults)
 
 
 def bench(system: Model, *, rounds: int = ROUNDS, duration: Fraction = DURATION) -> Bench:
-    """Measure every method of analysis and of simulation on a topology.
+    """Return the measurements of every method of analysis and simulation on a topology.
 
     Parameters
     ----------
     system
-        The compiled topology, with the numbers to use.
+        The model, with the parameter values to use.
     rounds
-        Runs of each method, fewer of slow ones.
+        The number of runs of each method, fewer for slow methods.
     duration
         The duration of the simulation, in seconds.
 
     Raises
     ------
     ApcError
-        The topology can't be analysed at all.
+        No method can analyze the topology.
     """
     with single_threaded():
         analysis = bench_analysis(system, rounds=rounds)
         try:
             simulation = bench_simulation(system, duration, rounds=rounds)
-        except ApcError as error:  # a model too large to simulate can still be analysed
-            simulation = _simulation(duration, (), "nothing is played", (("every method", reason_of(error)),))
+        except ApcError as error:  # a model that is too large for simulation can still be analyzed
+            simulation = _simulation_comparison(
+                duration, (), "no simulation", (("every method", reason_of(error)),)
+            )
     return Bench(system.name, system.peers, machine(), (analysis, simulation))
 
 
 def reason_of(error: ApcError) -> str:
-    """Return why something was refused; the line to write instead is of another command."""
-    return replace(error.mistakes[0], hint="").sentence.removesuffix(".")
+    """Return the text of an error without its fix, which would be for another command."""
+    return replace(error.mistakes[0], fix="").sentence.removesuffix(".")
 
 
 def machine() -> dict[str, str]:
-    """Return the description of the machine."""
+    """Return the description of the machine and of the libraries, by property."""
     return {
         "system": f"{platform.system()} {platform.machine()}",
         "processor": _processor(),
@@ -180,6 +187,7 @@ def machine() -> dict[str, str]:
 
 
 def _processor() -> str:
+    """Return the name of the processor."""
     try:
         with open("/proc/cpuinfo", encoding="utf-8") as file:  # noqa: PTH123 -- one line of a file of the kernel's
             return next(
@@ -189,25 +197,34 @@ def _processor() -> str:
         return platform.processor()
 
 
-def bench_analysis(system: Model, *, rounds: int = ROUNDS) -> TaskComparison:
-    """Measure every method of analysis, from the compiled topology to its verdict.
+def analysis_of(system: Model, *, method: str = AUTO, certify: bool = False) -> Analysis:
+    """Return the analysis of a model, with its Jacobians and schedules; parameters as for `analyze`."""
+    return analyze(numeric_model(system), method=method, certify=certify)
 
-    The error is that of the spectral radius, rigid modes left out.
+
+def bench_analysis(system: Model, *, rounds: int = ROUNDS) -> TaskComparison:
+    """Return the measurements of every method of analysis, from the compiled topology to the verdict.
+
+    The error is that of the spectral radius without rigid modes.
     """
     calls: dict[str, Callable[[], Analysis]] = {
-        name: partial(analyze, system, method=name) for name in ANALYSES if name not in (CERTIFIED, PAPER)
+        name: partial(analysis_of, system, method=name) for name in ANALYSES if name not in (CERTIFIED, PAPER)
     }
-    calls[CERTIFIED] = partial(analyze, system, certify=True)
-    calls[PAPER] = partial(analyze_paper, system)
-    default = analyze(system)
+    calls[CERTIFIED] = partial(analysis_of, system, certify=True)
+    if paper_method := find_extension("paper_method"):
+        calls[PAPER] = partial(paper_method.analyze_paper, system)
+    default = analysis_of(system)
     limitations = []
-    truth, text = None, "the same equations in 512-bit balls, of the numbers as doubles: spectral radius"
+    truth, text = (
+        None,
+        "the same equations in 512-bit ball arithmetic, with parameters as doubles: spectral radius",
+    )
     try:
         truth = spectral_truth(system)
         text = f"{text} {truth.digits}"
     except NotSupportedError as why:
         text = str(why)
-    results, refused, slow = _first(calls)
+    results, refused, slow = _first_results(calls)
     if CERTIFIED in results and (reason := _not_proved(results[CERTIFIED])):
         limitations.append((CERTIFIED, reason))
         del results[CERTIFIED]
@@ -215,7 +232,7 @@ def bench_analysis(system: Model, *, rounds: int = ROUNDS) -> TaskComparison:
         {name: calls[name] for name in results if name not in slow}, rounds, enough=ENOUGH
     )
     measured = [
-        _measured(
+        _timing(
             name,
             times[name],
             error=truth.error_of(result.spectral_radius) if truth else None,
@@ -246,7 +263,7 @@ def bench_analysis(system: Model, *, rounds: int = ROUNDS) -> TaskComparison:
 
 
 def _not_proved(analysis: Analysis) -> str:
-    """Return why an analysis that was to prove its verdict did not, "" if it did."""
+    """Return the reason why an analysis did not prove its verdict, "" if it did."""
     outcome = analysis.proof.outcome
     if outcome is not None and outcome.proved:
         return ""
@@ -256,49 +273,55 @@ def _not_proved(analysis: Analysis) -> str:
 
 
 def bench_simulation(system: Model, duration: Fraction = DURATION, *, rounds: int = ROUNDS) -> TaskComparison:
-    """Measure every method of simulation, from the first instant to the last.
+    """Return the measurements of every method of simulation, from the first instant to the last.
 
-    The error is the largest distance of any continuous state at any tick from the exact transition, relative
-    to the largest value that a state of its unit takes. The exact transition itself is as far off as it moves
-    where every coefficient is off by one rounding (see `accuracy`).
+    The error is the largest distance of all continuous states at all ticks from the exact transition,
+    relative to the largest value of all states with the same unit. The error of the exact transition is its
+    change if every coefficient is changed by one rounding (see `accuracy`).
     """
     notes = []
-    if _rests(system, duration):
-        system, how = _moved(system)
-        notes.append(f"nothing moves in this topology: {how}")
-    calls = {str(method): partial(_ready, system, duration, method) for method in _methods(system)}
-    ready, refused, _ = _first(calls)
-    times = alternate({name: partial(_simulate, item) for name, item in ready.items()}, rounds, enough=ENOUGH)
+    if _is_at_rest(system, duration):
+        system, how = _with_displaced_start(system)
+        notes.append(f"this topology is at rest: {how}")
+    calls = {
+        str(method): partial(_prepared_simulation, system, duration, method) for method in _methods(system)
+    }
+    simulations, refused, _ = _first_results(calls)
+    times = alternate(
+        {name: partial(_simulate, item) for name, item in simulations.items()}, rounds, enough=ENOUGH
+    )
     chosen = prepare(system, Settings(duration)).how
-    exact = ready.get(EXACT)
+    exact = simulations.get(EXACT)
     rounded, _ = finer(Method(EXACT), all_linear=True)
     measured = [
-        _measured(
+        _timing(
             name,
             times[name],
-            error=exact and _distance(_ready(system, duration, rounded) if item is exact else item, exact),
+            error=exact
+            and _distance(_prepared_simulation(system, duration, rounded) if item is exact else item, exact),
             bound=None,
             chosen=name == chosen or (name == str(DEFAULT) and chosen != EXACT),
         )
-        for name, item in ready.items()
+        for name, item in simulations.items()
     ]
-    exact_by = "the exact transition, itself off by what one rounding of each number makes"
+    exact_by = "the exact transition matrix, whose error is that of one rounding of each coefficient"
     text = str(dict(refused).get(EXACT, exact_by))
-    return _simulation(duration, pareto_front(measured), text, refused, tuple(notes))
+    return _simulation_comparison(duration, pareto_front(measured), text, refused, tuple(notes))
 
 
-def _simulation(
+def _simulation_comparison(
     duration: Fraction,
     measured: tuple[MethodTiming, ...],
     reference: str,
     refused: tuple[tuple[str, Note], ...],
     notes: tuple[Note, ...] = (),
 ) -> TaskComparison:
+    """Return the comparison of simulation methods, with the texts of this task."""
     return TaskComparison(
         task="simulate",
         quantity=f"states over {float(duration):g} s",
         relative="relative to the largest value of a state's unit",
-        timed="a run, without what prepares it",
+        timed="a run, without its preparation",
         measured=measured,
         reference=reference,
         refused=refused,
@@ -307,7 +330,7 @@ def _simulation(
 
 
 def _methods(system: Model) -> list[Method]:
-    """Return the methods to compare, their steps cut from the period of the fastest clock."""
+    """Return the simulation methods to compare, with steps that divide the period of the fastest clock."""
     seconds = resolve(system).timings
     tick = min((seconds[clock.period] for clock in system.clocks), default=Fraction(1, 1000))
     return [
@@ -318,8 +341,8 @@ def _methods(system: Model) -> list[Method]:
     ]
 
 
-def _rests(system: Model, duration: Fraction) -> bool:
-    """Say whether no state ever changes: whatever pushes, and be it between two ticks, leaves its trace."""
+def _is_at_rest(system: Model, duration: Fraction) -> bool:
+    """Return whether no continuous state changes during a simulation."""
     names = tuple(dict.fromkeys(state.name for peer_type in system.peer_types for state in peer_type.states))
     if not names:
         return False
@@ -331,8 +354,12 @@ def _rests(system: Model, duration: Fraction) -> bool:
     return True
 
 
-def _moved(system: Model) -> tuple[Model, str]:
-    """Let the first peer start by its first state's own scale elsewhere, and say so."""
+def _with_displaced_start(system: Model) -> tuple[Model, str]:
+    """Return the model with the first state of the first peer displaced at the start, and a text that
+    describes this.
+
+    The displacement is the scale of the state.
+    """
     first, *others = system.groups
     peer_type, numbers = system.peer_types[first.peer_type], resolve(system)
     state = peer_type.states[0]
@@ -345,42 +372,52 @@ def _moved(system: Model) -> tuple[Model, str]:
         PeerColumn(state.start, values),
     )
     changed = replace(system, groups=(replace(first, columns=columns), *others))
-    return changed, f"{state.name} of its first peer starts {with_unit(f'{by:g}', state.unit)} elsewhere"
+    return (
+        changed,
+        f"the initial {state.name} of the first peer is displaced by {with_unit(f'{by:g}', state.unit)}",
+    )
 
 
-def _ready(system: Model, duration: Fraction, method: Method) -> Simulation:
+def _prepared_simulation(system: Model, duration: Fraction, method: Method) -> Simulation:
+    """Return the prepared simulation by one method."""
     return prepare(system, Settings(duration, method))
 
 
 def _simulate(simulation: Simulation) -> None:
+    """Run a simulation without storing the result."""
     for _ in blocks(simulation):
         pass
 
 
 def _distance(simulation: Simulation, exact: Simulation) -> float:
-    """Return how far any state is from an exact run, relative to the largest value of its unit there."""
+    """Return the largest distance of all states from an exact simulation.
+
+    The distance is relative to the largest value of all states with the same unit in the exact simulation.
+    """
     names = {state.name for peer_type in simulation.system.peer_types for state in peer_type.states}
-    moving = [index for index, signal in enumerate(exact.signals) if signal.local in names]
+    state_columns = [index for index, signal in enumerate(exact.signals) if signal.local in names]
     rows = (row for block in blocks(simulation) for row in block.values)
-    separation, size = np.zeros(len(moving)), np.zeros(len(moving))
+    largest_difference, largest_value = np.zeros(len(state_columns)), np.zeros(len(state_columns))
     for block in blocks(exact):
-        for row in block.values[:, moving]:
+        for row in block.values[:, state_columns]:
             other = next(rows, None)
             if other is None:
-                return np.inf  # it left the range of floats
-            separation, size = (
-                np.maximum(separation, np.abs(other[moving] - row)),
-                np.maximum(size, np.abs(row)),
+                return np.inf  # the simulation ended outside the range of floats
+            largest_difference, largest_value = (
+                np.maximum(largest_difference, np.abs(other[state_columns] - row)),
+                np.maximum(largest_value, np.abs(row)),
             )
     worst = 0.0
-    units = np.array([exact.signals[index].unit for index in moving])
+    units = np.array([exact.signals[index].unit for index in state_columns])
     for unit in dict.fromkeys(units.tolist()):
-        error, largest = (float(values[units == unit].max()) for values in (separation, size))
+        error, largest = (
+            float(values[units == unit].max()) for values in (largest_difference, largest_value)
+        )
         worst = max(worst, error / largest if largest else error)
     return worst
 
 
-def _first(
+def _first_results(
     calls: Mapping[str, Callable[[], Any]],
 ) -> tuple[dict[str, Any], tuple[tuple[str, Note], ...], dict[str, list[float]]]:
     """Call each method once; return the results, the failures with reasons, and the times of slow methods."""
@@ -391,7 +428,9 @@ def _first(
             seconds, results[name] = timed(call)
         except ApcError as error:
             refused.append((name, reason_of(error)))
-        except Exception as error:  # a bug of one method is a result, and no reason to lose the others'
+        except (
+            Exception
+        ) as error:  # a crash of one method is a result, and must not prevent the other results
             refused.append((name, Limitation(LimitationCode.CRASHED, (repr(error),))))
         else:
             if seconds > ENOUGH:
@@ -399,31 +438,34 @@ def _first(
     return results, tuple(refused), slow
 
 
-def _measured(
+def _timing(
     name: str, times: Sequence[float], *, error: float | None, bound: float | None, chosen: bool
 ) -> MethodTiming:
+    """Return the measurement of one method from the times of its runs."""
     return MethodTiming(name, statistics.median(times), spread_of(times), len(times), error, bound, chosen)
 
 
 def pareto_front(measured: Sequence[MethodTiming]) -> tuple[MethodTiming, ...]:
-    """Mark what no other is better than in both ways, and sort by time.
+    """Return the measurements sorted by time, with those on the Pareto front of time and error marked.
 
-    One beats another if it is faster by more than both spreads together and not less right, or more right and
-    not slower. Half the distance between the quartiles is 0.67 of a normal deviation σ, the median of 15 runs
-    is certain to 0.32 σ, so that a difference of both spreads is three deviations of the random part. More
-    right is what errs less by more than chance (`SAME`). Without errors there is no front.
+    A method dominates another if it is faster by more than the sum of both spreads and not less accurate, or
+    more accurate and not slower. Half the interquartile range is 0.67 standard deviations σ, the standard
+    error of the median of 15 runs is 0.32 σ, so that the sum of both spreads is three standard errors. A
+    method is more accurate if its error is smaller by more than rounding (`SAME`). Without errors there is no
+    front.
     """
     return tuple(
         replace(
             item,
             front=item.error is not None
-            and not any(_beats(other, item) for other in measured if other.error is not None),
+            and not any(_dominates(other, item) for other in measured if other.error is not None),
         )
         for item in sorted(measured, key=lambda measured: measured.seconds)
     )
 
 
-def _beats(measured: MethodTiming, other: MethodTiming) -> bool:
+def _dominates(measured: MethodTiming, other: MethodTiming) -> bool:
+    """Return whether a measurement dominates another in time and error."""
     faster = measured.seconds + measured.spread + other.spread < other.seconds
-    mine, theirs = (max(m.error or 0.0, SAME) for m in (measured, other))
-    return (faster and mine <= theirs) or (mine < theirs and measured.seconds <= other.seconds)
+    error, other_error = (max(m.error or 0.0, SAME) for m in (measured, other))
+    return (faster and error <= other_error) or (error < other_error and measured.seconds <= other.seconds)

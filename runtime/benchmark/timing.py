@@ -1,10 +1,10 @@
-"""How long a call takes: the one clock of every figure.
+"""Measurement of the processor time of calls.
 
 Takes: calls.
 Gives: `timed`, `median_time`, `alternate`, `spread_of`.
-Guarantees: a time is the processor's, of this process and all its threads, so that what else a machine does
-counts little; of several the median counts, which one slow run doesn't move.
-Does not: count the time of other processes.
+Guarantees: times are processor times of this process and its threads, which depend little on the load of the
+machine; of several runs the median is used, which is robust to single slow runs.
+Does not: include the time of other processes.
 """
 
 from __future__ import annotations
@@ -17,50 +17,52 @@ from typing import Any, TypeVar
 
 Result = TypeVar("Result")
 
-# In turns each call runs so often at least, whatever it takes: a median of fewer is no median.
+# The smallest number of runs of each call in rounds, for a meaningful median.
 LEAST_ROUNDS = 3
 
 
 def timed(call: Callable[[], Result]) -> tuple[float, Result]:
-    """Return the processor's seconds of a call, and its result."""
-    began = time.process_time()
+    """Return the processor time of a call in seconds, and the result of the call."""
+    start = time.process_time()
     result = call()
-    return time.process_time() - began, result
+    return time.process_time() - start, result
 
 
 def median_time(call: Callable[[], Result], runs: int, *, enough: float = math.inf) -> tuple[float, Result]:
-    """Return the median of the processor's seconds of some runs, and the result of the last one.
+    """Return the median processor time of several runs in seconds, and the result of the last run.
 
     Parameters
     ----------
     call
         The function to run, at least once.
     runs
-        How often.
+        The largest number of runs.
     enough
-        Seconds of all runs together after which there is no further one.
+        The total time of all runs in seconds after which no further run starts.
     """
-    used, result = timed(call)
-    times = [used]
+    seconds, result = timed(call)
+    times = [seconds]
     while len(times) < runs and sum(times) < enough:
-        used, result = timed(call)
-        times.append(used)
+        seconds, result = timed(call)
+        times.append(seconds)
     return statistics.median(times), result
 
 
 def alternate(
     calls: Mapping[str, Callable[[], Any]], rounds: int, *, enough: float = math.inf
 ) -> dict[str, list[float]]:
-    """Time all calls in rounds, so that a temporary load on the machine slows all of them equally.
+    """Return the processor times of all calls in seconds, by name.
+
+    The calls run in rounds, so that a temporary load of the machine affects all of them equally.
 
     Parameters
     ----------
     calls
-        By name.
+        The calls by name.
     rounds
-        Runs of each.
+        The largest number of runs of each call.
     enough
-        Seconds of one call's runs together after which it has `LEAST_ROUNDS` at most.
+        The total time of a call in seconds after which the call has at most `LEAST_ROUNDS` runs.
     """
     times: dict[str, list[float]] = {name: [] for name in calls}
     for number in range(rounds):
@@ -71,7 +73,7 @@ def alternate(
 
 
 def spread_of(times: Sequence[float]) -> float:
-    """Return half the distance between the quartiles, 0 of a single time."""
+    """Return half the interquartile range of times, 0 for a single time."""
     if len(times) < 2:
         return 0.0
     low, _, high = statistics.quantiles(times, n=4)

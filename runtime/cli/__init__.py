@@ -1,4 +1,4 @@
-"""What a person types: the commands, their options, what they read and write."""
+"""The command line: commands, options, input and output."""
 
 import lazy_loader  # type: ignore[import-untyped] # it ships no types
 

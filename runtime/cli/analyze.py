@@ -20,7 +20,7 @@ from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 
 if TYPE_CHECKING:
     from apc.compiler.compiled import Model
-    from apc.frame.parameter_names import Range
+    from apc.parameter_values.parameter_names import Range
 
 # Of peers that all differ, by the thousand: 100,000 took 9 s on one core of 2026.
 SECONDS_A_PEER = 1e-4
@@ -32,65 +32,55 @@ def analyze_command(
     file: str | None,
     settings: tuple[str, ...],
     method: str = option(
-        "auto: what serves the topology. modes: a few small systems. dense: all peers in one, to check. "
-        "determinant: zeros of a small determinant, for peers that all differ and for long delays. "
-        "paper: the lifted matrices of Rakhsha and "
-        "Constantinescu, eqs. (18) to (20).",
-        "METHOD",
-        type=click.Choice(METHODS),
-        default=AUTO,
+        "auto, modes, dense, determinant or paper.", "METHOD", type=click.Choice(METHODS), default=AUTO
     ),
-    certify: bool = option("Prove the verdict in ball arithmetic, for the numbers as doubles."),
+    certify: bool = option("Prove the verdict in ball arithmetic."),
     box: tuple[str, ...] = option(
-        "Prove stability for every value within, over the network as it is, e.g. "
-        '--box contact.stiffness=±1%, or --box "lan.delay=8 ms:20 ms", at every constant delay, and '
-        "as it changes from packet to packet. "
-        "May be repeated.",
-        "PATH=±P%",
+        "Prove stability over a range, e.g. contact.stiffness=±1% (repeatable).",
+        "PATH=RANGE",
     ),
     cells: int | None = option(
-        "Divide the box into so many cells at most before it is left undecided; without it, into as many as "
-        "take some seconds.",
+        "Maximum number of cells of a --box.",
         "N",
         type=click.IntRange(min=1),
+        show_default="some seconds of work",
     ),
-    every_convention: bool = option(
-        "Repeat the analysis under every order of events that coincide.", name="--event-order"
-    ),
+    every_convention: bool = option("Repeat for every order of simultaneous events.", name="--event-order"),
     margins: bool | None = option(
-        "Look for all margins, however long it takes, or for none: how far stiffnesses, dampings and delays "
-        "may grow. Without either, for all in a topology where that takes a second or so.",
+        "Compute all stability margins, or none.",
         name="--margins/--no-margins",
         default=None,
+        show_default="all if fast",
     ),
-    nominal: bool = option(
-        "Of a network that loses or delays packets, say all of the nominal one, too: modes, sensitivities, "
-        "margins."
-    ),
+    nominal: bool = option("Also analyze the nominal network (no loss)."),
     with_limit_cycle: bool = option(
-        "Predict how one-sided contacts buzz, and play the topology for up to 80 s to lay it beside.",
-        name="--limit-cycle",
+        "Predict limit cycles of contacts, and simulate up to 80 s for comparison.", name="--limit-cycle"
     ),
+    modes: str = option("Rows of the mode table.", type=click.Choice(("slowest", "all")), default="slowest"),
     hands: str,
-    plot: Path | None = picture_option("Draw the eigenvalues over the unit circle: .png, .svg or .pdf."),
+    plot: Path | None = picture_option("Plot the eigenvalues (.png, .svg, .pdf)."),
     as_json: bool,
 ) -> None:
-    """Say whether a topology is stable, by how much, and in which modes.
+    """Analyze stability: verdict, margins, sensitivities, modes.
 
-    FILE is a topology or a compiled model. The spectral radius is per frame,
-    the time after which all clocks stand as before; below 1 every motion
-    dies out. A motion of all peers together, which nothing hinders, is left
-    out of it and named. Beside the verdict stand what moves the radius most,
-    how far each coupler and delay may grow, and for contacts that push and
-    never pull, which of them make it unstable, and whether they may open and
-    close at will.
+    A topology is stable if its spectral radius per frame is below 1; free
+    common translations are excluded. The frame is the least common multiple
+    of the clock periods. FILE is a topology or a compiled model.
+
+    \b
+    --method  modes: decoupled subsystems; dense: one matrix; determinant:
+              non-identical peers, long delays; paper: Rakhsha and
+              Constantinescu, eqs. (18) to (20)
+    --hands   clamped: fixed devices; held: hand.mass, hand.damping and
+              hand.stiffness by --set; passive: absolute stability with any
+              passive operator; or a hand of the library (StylusArmForward)
     """
     from apc.analysis_report import answer
-    from apc.frame.devices import HANDS, PASSIVE, published
-    from apc.inputs import open_topology
+    from apc.inputs.open_model import open_topology
+    from apc.lifting.devices import HANDS, PASSIVE, published
 
     if cells is not None and not box and hands in (*HANDS, PASSIVE):  # hands of the library make a box
-        raise click.UsageError("--cells wants a --box to divide")
+        raise click.UsageError("--cells requires --box")
     system = open_topology(file, settings, {"--plot": plot}, hands=hands, varied=box, notify=note_aside)
     if hands == PASSIVE:
         requested = {
@@ -106,7 +96,7 @@ def analyze_command(
         box = (*box, *(f"{name}={low}:{high}" for name, (low, high, _) in published(hands).items()))
     ranges = _ranges(system, box)
     listed = sum(group.count for group in system.groups if group.columns)
-    with at_work(f"analysing {system.peers:,} peers", about=SECONDS_A_PEER * listed):
+    with at_work(f"analyzing {system.peers:,} peers", about=SECONDS_A_PEER * listed):
         result = answer(
             system,
             method=method,
@@ -117,7 +107,7 @@ def analyze_command(
             margins=margins,
             with_limit_cycle=with_limit_cycle,
         )
-    result = replace(result, nominal=nominal)
+    result = replace(result, nominal=nominal, all_modes=modes == "all")
     if plot is not None:
         from apc.output.pictures import write_picture
 
@@ -126,28 +116,27 @@ def analyze_command(
 
 
 def _ranges(system: Model, box: tuple[str, ...]) -> list[Range]:
-    """Return the ranges of a box as they are written, and those that the topology gives."""
-    from apc.analysis.parametric_frames import parse_range
-    from apc.frame.parameter_names import given_ranges
+    """Return the ranges of --box and those of the topology."""
+    from apc.parameter_values.parameter_names import given_ranges
+    from apc.studies.parameter_ranges import parse_range
 
-    return given_ranges(system, [parse_range(system, text) for text in box])
+    return given_ranges(system, [parse_range(system, text, SourceLocation("--box")) for text in box])
 
 
 def _absolute_stability(
     system: Model, requested: list[str], box: tuple[str, ...], *, certify: bool, as_json: bool
 ) -> None:
-    """Say whether a topology is stable with any passive hands, at all delays if asked; refuse anything
-    else.
-    """
+    """Print the absolute stability, also for ranges of delays. Raises ApcError E930 for other options."""
     from apc.haptics.absolute_stability import absolute_stability
+    from apc.lifting.numeric_model import numeric_model
 
     if requested:
-        options = " and ".join((*requested, "--hands passive"))
-        message = f"{options} don't go together: what hands can draw has no modes of its own"
-        raise ApcError(Diagnostic("E930", SourceLocation("--hands"), message, hint="--hands clamped"))
+        verb = "is" if len(requested) == 1 else "are"
+        message = f"{' and '.join(requested)} {verb} not available with --hands passive"
+        raise ApcError(Diagnostic("E930", SourceLocation("--hands"), message, fix="--hands clamped"))
     if ranges := _ranges(system, box):
         from apc.analysis_report import robust_stability
 
         print_result(robust_stability(system, ranges, passive=True), as_json=as_json)
         return
-    print_result(absolute_stability(system, certify=certify), as_json=as_json)
+    print_result(absolute_stability(numeric_model(system), certify=certify), as_json=as_json)

@@ -24,16 +24,12 @@ def bench_command(
     *,
     file: str | None,
     settings: tuple[str, ...],
-    plot: Path | None = picture_option("Draw error against time: .png, .svg or .pdf."),
+    plot: Path | None = picture_option("Plot error against time (.png, .svg, .pdf)."),
     counts: str | None = option(
-        "Measure with these numbers of peers of one group instead: that of the largest written count. "
-        "Not with --set or --plot.",
-        "3,30,300",
-        name="--scale",
+        "Measure with these numbers of peers (not with --set, --plot).", "3,30,300", name="--scale"
     ),
     folder: Path | None = option(
-        f"Analyse a folder of topologies whose truth is known instead ({HARD} if not given). "
-        "Not with FILE, --set, --plot or --scale.",
+        f"Analyze reference topologies with known results, by default {HARD}.",
         "[FOLDER]",
         name="--hard",
         is_flag=False,
@@ -41,16 +37,12 @@ def bench_command(
     ),
     as_json: bool,
 ) -> None:
-    """Measure speed against error, on this topology and this machine.
+    """Measure the speed and accuracy of every method.
 
-    Every method of analysis and of simulation that can serve the topology is
-    timed, and its error found: of a spectral radius against the same equations
-    in 512-bit balls, to fifty digits; of a motion against the exact transition.
-    A star marks those that none is better than in both. FILE is a topology or
-    a compiled model. Fifty digits are had where what the topology falls into has
-    at most 110 states (equal peers count once), and a true error of motion
-    where all of it is linear between ticks; beyond, times and bounds stand
-    without a true error.
+    Spectral radii are compared with 50 digits in ball arithmetic (up to 110
+    states per decoupled subsystem), trajectories with the exact transition
+    (linear dynamics). A star marks methods that no other method surpasses in
+    both speed and accuracy. FILE is a topology or a compiled model.
 
     \b
         apc bench --plot bench.png
@@ -59,16 +51,14 @@ def bench_command(
     """
     if folder is not None:
         if file or settings or plot or counts:
-            raise click.UsageError(
-                "--hard has topologies of its own: no FILE, --set, --plot or --scale with it"
-            )
+            raise click.UsageError("--hard can't be combined with FILE, --set, --plot or --scale")
         _hard(folder, as_json)
         return
-    from apc.inputs import find_input, open_topology
+    from apc.inputs.open_model import find_input, open_topology
 
     if counts is not None:
         if settings or plot:
-            raise click.UsageError("--scale compiles anew: no --set or --plot with it")
+            raise click.UsageError("--scale can't be combined with --set or --plot")
         _scale(find_input(file, compiled_too=False), counts, as_json)
         return
     from apc.benchmark.speed_and_error import bench
@@ -77,7 +67,7 @@ def bench_command(
     with at_work("measuring"):
         result = bench(system)
     print_result(result, as_json=as_json)
-    if plot is not None:  # what took minutes is printed already, should it be unable to be written
+    if plot is not None:  # after the result, which may take minutes, is printed
         from apc.output.bench_output import bench_picture
         from apc.output.pictures import write_picture
 
@@ -85,32 +75,30 @@ def bench_command(
         if not as_json:
             echo(f"  {plot} is written")
     if result.faults:
-        message = f"not everything came out right: {'; '.join(result.faults)}"
+        message = f"incorrect results: {'; '.join(result.faults)}"
         raise ApcError(Diagnostic("E922", SourceLocation(result.topology), message))
 
 
 def _hard(folder: Path, as_json: bool) -> None:
-    """Report the hard cases; a failure is exit code 1."""
+    """Print the results of the reference cases. Raises ApcError E922 for a failure."""
     from apc.benchmark.hard import run_hard_cases
 
     hard_report = run_hard_cases(folder)
     print_result(hard_report, as_json=as_json)
     if hard_report.failures:
         names = ", ".join(case.name for case in hard_report.failures)
-        raise ApcError(
-            Diagnostic("E922", SourceLocation(str(folder)), f"not every hard case came out right: {names}")
-        )
+        raise ApcError(Diagnostic("E922", SourceLocation(str(folder)), f"failed reference cases: {names}"))
 
 
 def _scale(path: Path, counts: str, as_json: bool) -> None:
-    """Report what more peers cost."""
+    """Print the computing time for several numbers of peers."""
     from apc.benchmark.scale import scale
 
     if path.suffix == ".apc":
-        message = "is a compiled model, whose peers are counted"
+        message = "compiled models have a fixed number of peers"
         raise ApcError(
             Diagnostic(
-                "E921", SourceLocation(str(path)), message, hint=f"apc bench {path.with_suffix('.yaml')}"
+                "E921", SourceLocation(str(path)), message, fix=f"apc bench {path.with_suffix('.yaml')}"
             )
         )
     try:
@@ -118,7 +106,9 @@ def _scale(path: Path, counts: str, as_json: bool) -> None:
     except ValueError:
         numbers = []
     if not numbers or not all(number.is_integer() for number in numbers):
-        expected = "numbers of peers like 3,30,300"
-        raise ApcError(Diagnostic("E921", SourceLocation("--scale"), "the list", expected, counts[:80]))
+        expected, fix = "whole numbers separated by commas", "--scale 3,30,300"
+        raise ApcError(
+            Diagnostic("E921", SourceLocation("--scale"), "numbers of peers", expected, counts[:80], fix)
+        )
     result = scale(path, [int(number) for number in numbers])
     print_result(result, as_json=as_json)

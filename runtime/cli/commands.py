@@ -1,7 +1,7 @@
-"""The commands: their names, and the page that lists them.
+"""The command group `apc`: names and sections of all commands.
 
-Takes: words of a command line. Gives: `apc`, which finds the command they name.
-Guarantees: a command's module is loaded when that command is named, or all are listed.
+Takes: words of a command line. Gives: `apc`, the group of all commands.
+Guarantees: a command's module is loaded when the command is used or listed.
 Does not: compute, or decide exit codes (see `__main__`).
 """
 
@@ -11,39 +11,26 @@ import click
 
 from apc import cli
 from apc.cli.options import echo
-from apc.renamed import COMMANDS
+from apc.compiler.errors import nearest
+from apc.support.renamed import COMMANDS
 
 CONTEXT = {"help_option_names": ["-h", "--help"], "max_content_width": 80}
 SUFFIX = "_command"  # of the functions that `apc.cli` names
 
-# The commands as they are listed: in the order of work.
-LISTED = [
-    "new",
-    "check",
-    "compile",
-    "analyze",
-    "critical",
-    "region",
-    "tune",
-    "sweep",
-    "compare",
-    "transparency",
-    "simulate",
-    "explore",
-    "network",
-    "run",
-    "report",
-    "export",
-    "show",
-    "library",
-    "schema",
-    "bench",
-]
+# The commands in the order of work, by section of the help.
+SECTIONS = {
+    "Start": ("new", "library", "check", "compile", "show", "schema"),
+    "Analyze": ("analyze", "critical", "region", "sweep", "transparency", "compare"),
+    "Design": ("tune", "explore"),
+    "Simulate": ("simulate", "run"),
+    "Network": ("network",),
+    "Export": ("export", "report", "bench"),
+}
 
 
 def _print_version(context: click.Context, _: click.Parameter, requested: bool) -> None:
     if requested:
-        from apc.distribution import program_version
+        from apc.support.distribution import program_version
 
         echo(f"apc {program_version()}")
         context.exit()
@@ -54,7 +41,22 @@ class CommandGroup(click.Group):
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         """Return the names of the commands."""
-        return LISTED
+        return [name for names in SECTIONS.values() for name in names]
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the commands with their short help, one section for each step of the work."""
+        width = max(map(len, self.list_commands(ctx)))
+        limit = formatter.width - 6 - width  # indentation, and the space between the columns
+        for section, names in SECTIONS.items():
+            commands = [(name, self.get_command(ctx, name)) for name in names]
+            with formatter.section(section):
+                formatter.write_dl(
+                    [
+                        (f"{name:<{width}}", command.get_short_help_str(limit))
+                        for name, command in commands
+                        if command is not None
+                    ]
+                )
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         """Return the command of a name, whose module is loaded now; None if there is none.
@@ -62,9 +64,23 @@ class CommandGroup(click.Group):
         Raises click.UsageError for a former name.
         """
         if cmd_name in COMMANDS:
-            raise click.UsageError(f"apc {cmd_name} is named apc {COMMANDS[cmd_name]} now.", ctx)
+            raise click.UsageError(
+                f"unknown command {cmd_name}; its present name is {COMMANDS[cmd_name]}.", ctx
+            )
         command: click.Command | None = getattr(cli, f"{cmd_name}{SUFFIX}", None)
         return command
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """Return the name, the command and the other words of a command line.
+
+        Raises click.UsageError with the nearest name for an unknown command.
+        """
+        near = "" if self.get_command(ctx, args[0]) else nearest(args[0], self.list_commands(ctx))
+        if near:
+            raise click.UsageError(f"No such command {args[0]!r}. Did you mean {near!r}?", ctx)
+        return super().resolve_command(ctx, args)
 
 
 @click.group(cls=CommandGroup, context_settings=CONTEXT)
@@ -77,10 +93,9 @@ class CommandGroup(click.Group):
     help="Show the version.",
 )
 def apc() -> None:
-    """Is a shared virtual object stable in the hands of all its users?
+    """Stability analysis and simulation of networked haptic cooperation.
 
-    Describe users, masses, couplers and network links in a YAML file, a
-    topology; `apc new` writes one to start from.
-
-    Without FILE a command takes the only topology of the folder.
+    A topology is a YAML file of users, masses, couplers and network links;
+    `apc new` creates one. Without FILE, a command uses the only topology of the
+    folder.
     """

@@ -2,7 +2,7 @@
 
 Takes: words of a command line. Gives: text on stdout.
 Guarantees: with --json, stdout holds one JSON document and nothing else; a file that can't be written is
-refused before anything is computed; how far the work is goes to a terminal only.
+refused before anything is computed; the progress is printed on stderr.
 Does not: compute.
 """
 
@@ -29,35 +29,23 @@ def compare_command(
     *,
     files: tuple[str, ...] = argument(nargs=-1, required=True, metavar="FILE..."),
     over: tuple[str, ...] = option(
-        "Which stiffness, delay or loss is looked at, where a topology has several. May be repeated; a "
-        "topology "
-        "takes those it has.",
-        "PATH",
+        "Stiffness, delay or loss to vary, if there are several (repeatable).", "PATH"
     ),
     settings: tuple[str, ...],
     criterion: str | None,
     hands: str,
-    at: str = option(
-        "The device whose hand feels: left[1].device, or an axis of it. The first peer's that has one.",
-        "PEER.PART",
-    ),
+    at: str = option("Device of the impedance, or an axis of it.", "PEER.PART", show_default="first device"),
     out: Path | None = result_option(),
     as_json: bool,
 ) -> None:
-    """Put schemes side by side: verdicts, limits, what is felt, costs.
+    """Compare verdicts, limits, impedance and cost.
 
-    Of each FILE, a topology or a compiled model: the verdict and spectral
-    radius of `apc analyze`; what `apc simulate` says of its experiment, if it
-    is not linear and the verdict is that of its linearization; the largest
-    stable stiffness of what couples it to others, and the delay and loss of
-    the link that break it, as `apc critical` finds them; what the first
-    peer's hand feels at 1 and 10 Hz, of `apc transparency`; how much a tick computes
-    and how many numbers are sent. --set, --criterion and --hands hold for all files.
-    (To lay the stable regions of topologies over each other: apc region
-    --compare.)
+    The limits are those of the coupling stiffness, delay and packet loss. The
+    impedance is that of the first peer's device at 1 and 10 Hz. --set,
+    --criterion and --hands apply to every FILE, a topology or a compiled model.
+    For stability regions in one picture use apc region --compare.
 
-    A folder NAME.run of `apc run` is laid beside what simulate and analyze
-    say for the delays and losses that were measured.
+    A folder NAME.run of apc run is compared with simulation and analysis.
 
     \b
         apc compare average.yaml mesh.yaml --set "lan.delay=16 ms" \\
@@ -66,10 +54,10 @@ def compare_command(
     if len(files) == 1 and Path(files[0]).is_dir():
         _compare_run(Path(files[0]), as_json=as_json)
         return
-    from apc.comparison.comparison import compare
-    from apc.frame.devices import UNHELD, names_hand
-    from apc.inputs import open_topology
+    from apc.inputs.open_model import open_topology
+    from apc.lifting.devices import UNHELD, names_hand
     from apc.output.pictures import write_result
+    from apc.studies.comparison import compare
 
     requested = criterion_with(hands, criterion)
     note_typical_hand(hands)
@@ -94,7 +82,7 @@ def compare_command(
 
 
 def _compare_run(folder: Path, *, as_json: bool) -> None:
-    """Lay a run of `apc run` beside what is said of its topology."""
+    """Print the comparison of a real-time run with simulation and analysis."""
     from apc.realtime.run_comparison import compare_run
     from apc.realtime.run_folder import read_run
 

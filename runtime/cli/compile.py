@@ -1,7 +1,7 @@
 """The commands `apc check` and `apc compile`.
 
-Takes: words of a command line. Gives: text on stdout, a compiled model beside its topology.
-Guarantees: nothing is written where there is a mistake.
+Takes: words of a command line. Gives: text on stdout, a compiled model in the folder of its topology.
+Guarantees: no file is written if there is an error.
 Does not: compute.
 """
 
@@ -25,23 +25,23 @@ def check_command(
     *,
     file: str | None,
 ) -> None:
-    """Report every mistake in a topology or component; write nothing.
+    """Check a topology or component and report every error.
 
-    Exit code 0 if there is none, 1 otherwise.
+    Writes no file. Exit code 0 without errors, 1 otherwise.
     """
     from apc.analysis.nonlinear_elements import replaced_elements
     from apc.compiler.pipeline import check_definition, compile_topology
-    from apc.frame.start_checks import check_values
-    from apc.inputs import find_input
+    from apc.inputs.open_model import find_input
+    from apc.lifting.start_checks import check_values
     from apc.output.analysis_output import warning_lines
 
     path = find_input(file, compiled_too=False)
     if text := check_definition(path):
-        echo(f"{path}: no mistakes. {text}.")
+        echo(f"{path}: no errors. {text}.")
         return
     system = compile_topology(path)
     check_values(system)
-    echo(f"{path}: no mistakes. {system.name}, {counted(system.peers, 'peer')}.")
+    echo(f"{path}: no errors. {system.name}, {counted(system.peers, 'peer')}.")
     for line in warning_lines((*system.warnings, *replaced_elements(system))):
         echo(line)
 
@@ -51,22 +51,21 @@ def compile_command(
     *,
     file: str | None,
     until: str = option(
-        f"Stop after a stage, print what it made and write nothing. One of {', '.join(STAGES[:-1])}.",
+        f"Stop after a stage and print its result: {', '.join(STAGES[:-1])}.",
         "STAGE",
         type=click.Choice(STAGES),
         default="compiled",
         show_default=False,
     ),
-    force: bool = option("Compile even if nothing has changed since it was compiled."),
+    force: bool = option("Compile even if NAME.apc is up to date."),
 ) -> None:
-    """Turn a topology into equations: NAME.yaml to NAME.apc beside it.
+    """Compile a topology, NAME.yaml, to a model, NAME.apc.
 
-    Prints what the topology needed: states, delays and packets kept for a peer,
-    and how large the systems are that decide its stability. Compiles nothing
-    if the topology, every file it names and apc itself are as they were, and
-    no --timings are asked for.
+    Prints the model size: states, delays and packets per peer, and the sizes
+    of the decoupled subsystems. A model that is up to date is not compiled
+    again, except with --force or --timings.
     """
-    from apc.inputs import check_model_name, compiled_already, find_input
+    from apc.inputs.open_model import check_model_name, compiled_already, find_input
 
     path = find_input(file, compiled_too=False)
     if until != "compiled":
@@ -77,10 +76,12 @@ def compile_command(
         return
     if path.suffix == ".apc":
         raise ApcError(
-            Diagnostic("E614", SourceLocation(str(path)), "is compiled already", hint=f"apc analyze {path}")
+            Diagnostic(
+                "E614", SourceLocation(str(path)), "file is a compiled model", fix=f"apc analyze {path}"
+            )
         )
     if not (force or recording()) and compiled_already(path):
-        echo(f"{path} → {path.with_suffix('.apc')}: unchanged, not compiled again (--force does)")
+        echo(f"{path} → {path.with_suffix('.apc')}: up to date (--force compiles again)")
         return
     check_model_name(path)
     with at_work("compiling"):
@@ -92,7 +93,7 @@ def _compile(path: Path) -> None:
     from apc.analysis.model_size import model_size
     from apc.compiler.pipeline import compile_topology
     from apc.compiler.store import save
-    from apc.frame.start_checks import check_values
+    from apc.lifting.start_checks import check_values
     from apc.output.analysis_output import compile_text
 
     system = compile_topology(path)

@@ -1,13 +1,14 @@
 """The command `apc critical`.
 
 Takes: words of a command line. Gives: text on stdout.
-Guarantees: with --json, stdout holds one JSON document and nothing else; how far the search is goes to a
-terminal only.
+Guarantees: with --json, stdout holds one JSON document and nothing else; the progress is
+printed on stderr.
 Does not: compute.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -30,7 +31,9 @@ if TYPE_CHECKING:
     from apc.compiler.compiled import Model
     from apc.tuning.tuner import Tuning
 
-# What the name of a topology ends in.
+COMMAND = SourceLocation("apc critical")
+
+# The suffixes of topologies and models.
 TOPOLOGIES = (".yaml", ".yml", ".apc")
 
 
@@ -40,45 +43,38 @@ def critical_command(
     path: str = argument(),
     file: str | None,
     settings: tuple[str, ...],
-    upper: str | None = option("Look no further up than this.", '"VALUE UNIT"'),
-    lower: str | None = option("Look no further down than this.", '"VALUE UNIT"'),
+    upper: str | None = option("Upper end of the search.", '"VALUE UNIT"'),
+    lower: str | None = option("Lower end of the search.", '"VALUE UNIT"'),
     over: tuple[str, ...] = option(
-        "Find the largest value that is stable in all of this: user.count=2:10, device.mass=±20%, as for apc "
-        "tune. May be repeated.",
-        "PATH=LO:HI",
+        "Find the largest value stable for all of user.count=2:10 (repeatable; see tune).", "PATH=LO:HI"
     ),
     criterion: str | None,
     hands: str,
-    plot: Path | None = picture_option(
-        "Draw where the eigenvalues go as it grows (root locus): .png, .svg or .pdf."
-    ),
+    plot: Path | None = picture_option("Plot the root locus (.png, .svg, .pdf)."),
     as_json: bool,
 ) -> None:
-    """Find the largest stable value of a parameter, with its error.
+    """Compute the stability limits of a parameter.
 
-    PATH names a stiffness, damping, mass or delay, of one group or of all:
-    coordination.stiffness, left.device.mass, lan.delay. The values at which
-    the topology becomes stable or unstable are looked for, down to a cell size
-    that is printed; each is proved where it can be, and on which side of it
-    the topology is stable. FILE is a topology or a compiled model.
+    PATH is a stiffness, damping, mass, delay, period or number of peers:
+    coordination.stiffness, left.device.mass, lan.delay, user.count. Limits are
+    found up to a printed cell size, with error bounds and proof where possible.
+    FILE is a topology or a compiled model.
     """
-    from apc.inputs import open_topology
-    from apc.parameter_studies.critical_values import critical
+    from apc.inputs.open_model import open_topology
+    from apc.studies.critical_values import critical
 
     _check_order(path, file)
     requested = criterion_with(hands, criterion)
     note_typical_hand(hands)
     if plot is not None and requested == "passive":
-        message = "--plot and --hands passive don't go together: what hands can draw has no eigenvalues"
-        raise ApcError(Diagnostic("E930", SourceLocation("--hands"), message, hint="--hands clamped"))
+        message = "--plot is not available with --hands passive, which computes no eigenvalues"
+        raise ApcError(Diagnostic("E930", SourceLocation("--hands"), message, fix="--hands clamped"))
     system = open_topology(
         file, settings, {"--plot": plot}, hands=hands, varied=(path, *over), notify=note_aside
     )
     if over:
         if plot is not None:
-            raise click.UsageError(
-                "--plot and --over don't go together: there are as many loci as topologies"
-            )
+            raise click.UsageError("--plot can't be combined with --over")
         print_result(_over(system, path, (lower, upper), over, requested), as_json=as_json)
         return
     with status_line() as progress:
@@ -97,35 +93,54 @@ def _over(
     over: tuple[str, ...],
     criterion: str | None,
 ) -> Tuning:
-    """Return the largest value that is stable in all that is given: the best of one gain."""
-    from apc.frame.parameter_names import find, unit_of, value_now
-    from apc.parameter_studies.margins import GROWTH
-    from apc.tuning.specification import read_tuning_spec
+    """Return the largest value that is stable for all operating conditions, as the tuning of one gain."""
+    from apc.parameter_values.parameter_names import find, unit_of, value_now
+    from apc.studies.margins import GROWTH
+    from apc.studies.representative_delays import is_delay
+    from apc.support.option_value import option_value
+    from apc.tuning.specification import FREE, LOCATION, read_tuning_spec
     from apc.tuning.tuner import tune
 
-    free = find(system, path, SourceLocation("critical value"))
-    present, unit = value_now(system, free), unit_of(system, free.name)
+    parameter_ref = find(system, path, COMMAND)
+    if is_delay(system, parameter_ref):
+        message = f"{path} is a delay and can't be searched with --over"
+        raise ApcError(Diagnostic("E995", COMMAND, message, fix=f"apc critical {path}"))
+    present, unit = value_now(system, parameter_ref), unit_of(system, parameter_ref.name)
+    for end_option, end in zip(("--lower", "--upper"), ends, strict=True):
+        if end is not None:
+            option_value(end_option, end, subject=path, unit=unit)
     if not present and ends[1] is None:
-        raise click.UsageError(f"{path} is 0 now, which says nothing of how large it may be: give --upper")
+        raise click.UsageError(f"{path} is 0, and needs an upper end: --upper")
     low, high = ends[0] or f"0 {unit}", ends[1] or f"{GROWTH * abs(present):.12g} {unit}"
-    tuning_spec = read_tuning_spec(
-        system, [f"{path}={low}:{high}"], maximize=path, over=over, criterion=criterion
-    )
-    with status_line() as progress:
-        return tune(system, tuning_spec, progress=progress)
+    try:
+        tuning_spec = read_tuning_spec(
+            system, [f"{path}={low}:{high}"], maximize=path, over=over, criterion=criterion
+        )
+        with status_line() as progress:
+            return tune(system, tuning_spec, progress=progress)
+    except ApcError as error:
+        # The options --free and --maximize are not those of this command.
+        raise ApcError(
+            replace(mistake, location=COMMAND, fix="" if mistake.location == FREE else mistake.fix)
+            if mistake.location in (FREE, LOCATION)
+            else mistake
+            for mistake in error.mistakes
+        ) from None
 
 
 def _check_order(path: str, file: str | None) -> None:
-    """Refuse a topology where the parameter belongs: the two were exchanged, or only one was given."""
+    """Raise ApcError E841 for a topology instead of PATH: arguments exchanged, or PATH omitted."""
     if Path(path).suffix.lower() not in TOPOLOGIES:
         return
     got, name = f"{path}, then {file}", file
     if file is None or Path(file).suffix.lower() in TOPOLOGIES:  # then a name of the topology's own is shown
-        from apc.inputs import open_topology
-        from apc.parameter_studies.margins import coupler_parameters
+        from apc.inputs.open_model import open_topology
+        from apc.studies.margins import coupler_parameters
 
         got = got if file else f"{path} alone"
-        name = next((free.label for free in coupler_parameters(open_topology(path, ()))), None)
-    hint = f"apc critical {name} {path}" if name else ""
-    requested = "a parameter or delay, then the topology"
-    raise ApcError(Diagnostic("E841", SourceLocation("apc critical"), "the command", requested, got, hint))
+        name = next(
+            (parameter_ref.label for parameter_ref in coupler_parameters(open_topology(path, ()))), None
+        )
+    fix = f"apc critical {name} {path}" if name else ""
+    requested = "PATH, then FILE"
+    raise ApcError(Diagnostic("E841", COMMAND, "arguments", requested, got, fix))

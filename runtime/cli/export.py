@@ -1,6 +1,6 @@
 """The command `apc export`.
 
-Takes: words of a command line. Gives: a file, and what is in it on stdout.
+Takes: words of a command line. Gives: a file, and a summary of its contents on stdout.
 Guarantees: with --json, stdout holds one JSON document and nothing else; a file that can't be written is
 refused before anything is computed.
 Does not: compute, or know a format.
@@ -18,43 +18,27 @@ def export_command(
     *,
     file: str | None,
     to: str | None = option(
-        "control: a script that makes a python-control StateSpace (.py); mat, npz: the same matrices for "
-        "MATLAB, SciPy, NumPy; modelica: a flat model with clocks (.mo); c: one tick of a peer in C99, with "
-        "header and driver; fmu: the topology or a peer for co-simulation (FMI 2.0). Taken from --out if not "
-        "given.",
-        "FORMAT",
+        "control (.py), mat, npz, modelica (.mo), c, or fmu (FMI 2.0).", "FORMAT", show_default="from --out"
     ),
     settings: tuple[str, ...],
-    open_at: str = option(
-        "Cut the loop open at a link or a coupler, for margins and designs of your own: closed again by "
-        "u = -y it is the closed loop.",
-        "NAME",
-    ),
+    open_at: str = option("Open the loop at a link or coupler; u = -y closes it.", "NAME"),
     symbolic: tuple[str, ...] = option(
-        "Leave a number free: A, B, C and D are a casadi.Function of it too, `casadi_function` in the "
-        "file. May be repeated.",
-        "PATH",
+        "Keep a parameter symbolic: matrices as a casadi.Function (repeatable).", "PATH"
     ),
-    peer: str = option("For c and fmu: one peer, such as 'left[1]'. An FMU is of all.", "NAME"),
+    peer: str = option("Peer of the C code or FMU.", "NAME", show_default="fmu: all"),
     device: str = option(
-        "For c: what the peer's computer doesn't move, several with commas between, or none. What a hand "
-        "holds, or others are not told of, if not given.",
-        "MASS",
+        "Masses outside the C code, separated by commas, or none.", "MASS", show_default="the device"
     ),
-    method: str = option(
-        "For c and fmu: how states move between ticks, as for simulate; rk4:STEP where they are not linear.",
-        "METHOD",
-    ),
-    out: Path = option("The file to write."),
+    method: str = option("Integration method; see simulate.", "METHOD"),
+    out: Path = option("Output file."),
     as_json: bool,
 ) -> None:
-    """Hand a topology over to other tools.
+    """Export to MATLAB, python-control, Modelica, C or FMU.
 
-    FILE is a topology or a compiled model. As a state space it is the whole
-    loop over one frame, all peers in it: from a force on every mass and noise
-    on every measurement to every position, velocity and force. As a Modelica
-    model it is every equation, tick and packet; as C or an FMU a peer as it
-    computes, or all of them with the packets between.
+    The state space is the closed loop over one frame: from forces on all masses
+    and measurement noise to positions, velocities and forces. The Modelica
+    model contains all equations, clocks and packets. C code contains one peer,
+    an FMU one peer or all. FILE is a topology or a compiled model.
 
     \b
         apc export --out loop.mat
@@ -65,7 +49,7 @@ def export_command(
         apc export --out topology.fmu
     """
     from apc.exports.formats import ExportRequest, export, format_of
-    from apc.inputs import open_topology
+    from apc.inputs.open_model import open_topology
 
     chosen = format_of(to, out)
     system = open_topology(file, settings, {"--out": out}, notify=note_aside)

@@ -1,4 +1,4 @@
-"""The commands `apc library` and `apc new`: what comes with the program, looked at and copied.
+"""The commands `apc library` and `apc new`: listing and copying of components and topologies.
 
 Takes: words of a command line. Gives: text on stdout, new topologies.
 Guarantees: with --json, stdout holds one JSON document and nothing else; no file that exists is overwritten,
@@ -29,16 +29,13 @@ _TOPOLOGY = re.compile(r"^topology:\s*[^\s#]+", re.MULTILINE)
 def library_command(
     *,
     name: str | None = argument(required=False),
-    folder: Path | None = option(
-        "A folder of components of your own, as a topology's library: names one.", "DIR"
-    ),
+    folder: Path | None = option("Folder of additional components.", "DIR"),
     as_json: bool,
 ) -> None:
     """List the components of the library, or show one.
 
-    NAME is a component or connector: what it is, its parameters with their
-    units, defaults and limits, where it is from, and its definition, equations
-    and all, as it is written.
+    NAME is a component or connector. Printed are its description, parameters
+    with units, defaults and limits, its source, and its definition.
     """
     from apc.compiler.components.component_library import Library
     from apc.compiler.topology.topology import readable_library
@@ -64,36 +61,36 @@ def library_command(
 def new_command(
     *,
     name: str | None = argument(required=False),
-    like: str | None = option("Copy this topology of the library, and the tables it names.", "TOPOLOGY"),
-    listing: bool = option("Name the topologies of the library; write no topology.", name="--list"),
-    out: Path | None = option("With --list, write a page of them (.html): pictures, topologies, verdicts."),
+    like: str | None = option("Copy a topology of the library, with its tables.", "TOPOLOGY"),
+    listing: bool = option("List the topologies of the library.", name="--list"),
+    out: Path | None = option("With --list: write a page with pictures and verdicts (.html)."),
 ) -> None:
-    """Write NAME.yaml, a commented topology to start from.
+    """Create a commented topology, NAME.yaml.
 
-    NAME is "topology" if not given, or the name of the topology that is copied.
-    A file that exists is never overwritten.
+    NAME is "topology" by default, or the name of the copied topology. Existing
+    files are never overwritten.
     """
     from apc.compiler.view import catalogue
 
     if listing:
         if name is not None or like is not None:
-            raise click.UsageError("--list names the topologies and writes none: no NAME or --like with it")
+            raise click.UsageError("--list can't be combined with NAME or --like")
         echo("\n".join(catalogue.topology_lines()) if out is None else _gallery(out))
         return
     if out is not None:
-        raise click.UsageError("--out is of --list")
+        raise click.UsageError("--out requires --list")
     source = catalogue.topology_named(catalogue.TEMPLATE if like is None else like)
     name = name if name is not None else like or "topology"
     if not NAME.match(name):
-        message = "a topology's name"
-        expected = "letters, digits, - and _, 63 at most, with a letter or digit first"
+        message = "name of a topology"
+        expected = "letters, digits, - and _ (at most 63 characters, first a letter or digit)"
         raise ApcError(
             Diagnostic(
-                "E612", SourceLocation(name[:80] or "''"), message, expected, "this", "apc new my-topology"
+                "E612", SourceLocation("apc new"), message, expected, repr(name[:80]), "apc new my-topology"
             )
         )
     path = Path(f"{name}.yaml")
-    # Its first line names the schema beside the library; a schema beside the new topology serves as well.
+    # The first line names the schema of the library; it is replaced by a schema in the working folder.
     text = _FIRST_LINE.sub("", source.read_text(encoding="utf-8"))
     text = _TOPOLOGY.sub(f"topology: {name}", text, count=1)
     if Path(SCHEMA_FILE).is_file():
@@ -107,30 +104,30 @@ def new_command(
 
 
 def _gallery(out: Path) -> str:
-    """Write the page of the library's topologies; return what was written."""
+    """Write the page of the library's topologies; return the message."""
     from apc.compiler.files import check_target, write_text
     from apc.compiler.view.catalogue import topologies
-    from apc.optional import need
     from apc.output.pages import gallery_page
-    from apc.suffixes import check_suffix
+    from apc.support.optional import need
+    from apc.support.suffixes import check_suffix
 
     check_suffix(out, (".html",), "--out")
     check_target(out)
     need("matplotlib", "plot")
     paths = list(topologies().values())
-    with at_work(f"analysing {len(paths)} topologies"):
+    with at_work(f"analyzing {len(paths)} topologies"):
         write_text(out, gallery_page(paths))
     return f"{out} is written"
 
 
 def _is_there(table: Path) -> bool:
-    """Return whether the folder has a table already, as it is."""
+    """Return whether the working folder has an identical table."""
     path = Path(table.name)
     return path.is_file() and path.read_bytes() == table.read_bytes()
 
 
 def _write(texts: dict[Path, str]) -> None:
-    """Write new files, all or none. Raises ApcError: E613 one is there already, E601 one can't be written."""
+    """Write new files, all or none. Raises ApcError: E613 a file exists, E601 a file can't be written."""
     written: list[Path] = []
     try:
         for path, text in texts.items():
@@ -142,6 +139,6 @@ def _write(texts: dict[Path, str]) -> None:
             item.unlink(missing_ok=True)
         if not isinstance(error, FileExistsError):
             raise unwritable(path, error) from None
-        hint = "apc new another-name" if path == next(iter(texts)) else f"mv {path} another-name{path.suffix}"
-        message = "exists already and is left as it is"
-        raise ApcError(Diagnostic("E613", SourceLocation(str(path)), message, hint=hint)) from None
+        fix = "apc new another-name" if path == next(iter(texts)) else f"mv {path} another-name{path.suffix}"
+        message = "file exists and was not changed"
+        raise ApcError(Diagnostic("E613", SourceLocation(str(path)), message, fix=fix)) from None

@@ -17,28 +17,26 @@ from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 def network_command(
     *,
     recording: str = argument(),
-    interval: str | None = option(
-        "What lies between two packets, where RECORDING doesn't say.", '"VALUE UNIT"'
-    ),
-    out: Path | None = option("Write the delays as a table, a row a packet (.csv)."),
+    interval: str | None = option("Time between packets.", '"VALUE UNIT"', show_default="from RECORDING"),
+    out: Path | None = option("Write the delay of each packet as a table (.csv)."),
     as_json: bool,
 ) -> None:
-    """Say what a recorded network amounts to, as a link's own keys.
+    """Fit delay, jitter and loss of a link to a recorded network.
 
-    RECORDING is what `ping HOST > FILE` or `irtt client -o FILE.json HOST`
-    wrote, or a table with a column `delay [ms]`. Told are the share of packets
-    lost, whether losses come in bursts, delays and how they spread, and the
-    entry of a link that says so. A link's `trace` takes the same files.
+    RECORDING is the output of ping HOST > FILE or irtt client -o FILE.json
+    HOST, or a table with a column "delay [ms]". Printed are loss, bursts,
+    delays, and the entry of the link. The key trace of a link accepts the same
+    files.
 
     \b
         irtt client -i 8ms -d 60s -o lan.json HOST
         apc network lan.json
     """
     from apc.compiler.files import write_text
-    from apc.inputs import check_outputs
+    from apc.inputs.open_model import check_outputs
     from apc.network.link_fit import fit_recording
-    from apc.option_value import option_value
-    from apc.suffixes import check_suffix
+    from apc.support.option_value import option_value
+    from apc.support.suffixes import check_suffix
 
     if out is not None:
         check_suffix(out, (".csv",), "--out")
@@ -47,9 +45,9 @@ def network_command(
     if interval is not None:
         between = float(option_value("--interval", interval, subject="a time", unit="s"))
         if between <= 0:
-            expected, hint = "a time above 0", '--interval "8 ms"'
+            expected, fix = "more than 0 s", '--interval "8 ms"'
             raise ApcError(
-                Diagnostic("E207", SourceLocation("--interval"), "the interval", expected, interval, hint)
+                Diagnostic("E207", SourceLocation("--interval"), "interval", expected, interval, fix)
             )
     network_recording = fit_recording(recording, between)
     if out is not None:

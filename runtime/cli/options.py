@@ -1,6 +1,6 @@
-"""What commands have in common: how they are declared, options that several take, how a result is printed.
+"""Common parts of the commands: declaration, shared options, printing of results.
 
-Takes: a function whose parameters say what a command takes; a result.
+Takes: a function with the parameters of a command; a result.
 Gives: `command`, `option`, `argument`; `picture_option`, `result_option`, `seed_option`, `WholeNumber`;
 `criterion_with`; `print_result`, `echo`, `prints_to_stderr`, `note_aside`, `note_typical_hand`.
 Guarantees: with --json, one JSON document is printed and nothing else; nothing printed acts on the terminal;
@@ -10,6 +10,7 @@ Does not: know any command.
 
 from __future__ import annotations
 
+import contextlib
 import inspect
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -22,10 +23,10 @@ from apc.compiler.errors import ApcError, Diagnostic, SourceLocation, visible
 from apc.compiler.files import is_stdout
 from apc.compiler.number_parsing import plain_int
 from apc.compiler.timings import part, record
-from apc.output.formatting import json_text
-from apc.renamed import OPTIONS
+from apc.output.formatting import full_digits, json_text
 from apc.result import Result
-from apc.threads import start_single_threaded
+from apc.support.renamed import OPTIONS
+from apc.support.threads import start_single_threaded
 
 # Settings of an option by the annotation of its parameter, unless `option` overrides them.
 FILE = {"type": click.Path(path_type=Path), "metavar": "FILE"}
@@ -86,42 +87,41 @@ def picture_option(text: str, more: Sequence[str] = ()) -> Any:
 
 def result_option() -> Any:
     """Return the option `--out` of a result that can be drawn, tabulated, or written as JSON."""
-    text = "Write a picture (.png .svg .pdf), a table (.csv .parquet) or .json."
+    text = "Output file: picture (.png .svg .pdf), table (.csv .parquet) or .json."
     return picture_option(text, (".csv", ".parquet", ".json"))
 
 
-def seed_option(packets: str) -> Any:
-    """Return the option `--seed` of what happens by chance to `packets`, such as "that get lost"."""
-    text = f"Of packets {packets}; the experiment's if not given."
-    return option(text, "NUMBER", type=WholeNumber(0, 2**63 - 1))
+def seed_option() -> Any:
+    """Return the option `--seed` of packet losses and delays."""
+    text = "Seed of packet losses and delays."
+    return option(text, "N", type=WholeNumber(0, 2**63 - 1), show_default="experiment: seed")
 
 
-# What parameters without a default are, by their names.
+# The options and arguments of parameters without a default, by name.
 SHARED: dict[str, Callable[[inspect.Parameter], click.Parameter]] = {
     "file": argument(required=False),
-    "settings": option(
-        'Change a parameter first, e.g. --set contact.stiffness="800 N/m". May be repeated.',
-        'PATH="VALUE UNIT"',
-        name="--set",
-    ),
+    "settings": option("Set a parameter (repeatable).", 'PATH="VALUE UNIT"', name="--set"),
     "criterion": option(
-        "What stable means. mean-square: second moments die out over the network as it is, the default "
-        "where a link is unreliable; nominal: motions die out if every packet takes its nominal delay.",
+        "Stability criterion: mean-square (default on lossy links) or nominal (no loss, no jitter).",
+        "CRITERION",
         name="--criterion",
         type=click.Choice(("mean-square", "nominal")),
     ),
     "hands": option(
-        "What holds the devices. free: nothing but what the topology says. clamped: they are held "
-        "fast. held: "
-        "each by a hand of hand.mass, hand.damping and hand.stiffness, given by --set. passive: stable means "
-        "stable with all hands that give back no more energy than they got. Or a hand of the library, such "
-        "as StylusArmForward.",
-        "HANDS",
-        default="free",
+        "Operator model: free, clamped, held, passive, or a hand of the library.", "HANDS", default="free"
     ),
-    "duration": option('How long, such as "2 s"; that of the topology\'s experiment if not given.', '"TIME"'),
-    "as_json": option("Print one JSON document instead of text.", name="--json"),
+    "duration": option("Duration.", '"TIME"', show_default="experiment: duration"),
+    "as_json": option("Print JSON instead of text.", name="--json"),
 }
+
+
+DIGITS = click.Option(
+    ["--digits"],
+    type=click.Choice(("6", "full")),
+    default="6",
+    show_default=True,
+    help="Digits; full adds error bounds.",
+)
 
 
 def command(function: Callable[..., None]) -> Command:
@@ -131,30 +131,27 @@ def command(function: Callable[..., None]) -> Command:
         (SHARED[parameter.name] if parameter.default is parameter.empty else parameter.default)(parameter)
         for parameter in requested
     ]
-    made.append(click.Option(["--timings"], is_flag=True, help="Say on stderr how long each part took."))
+    if "as_json" in inspect.signature(function).parameters:
+        made.append(DIGITS)
+    made.append(click.Option(["--timings"], is_flag=True, help="Print the time of each step on stderr."))
     name = function.__name__.removesuffix("_command")
     return Command(name, callback=function, params=made, help=inspect.cleandoc(function.__doc__ or ""))
 
 
 def criterion_with(hands: str, criterion: str | None) -> str | None:
-    """Return the criterion that --criterion and --hands together ask for. Raises ApcError E930 where they
-    can't.
-    """
+    """Return the criterion of --criterion and --hands. Raises ApcError E930 if they are incompatible."""
     if hands != "passive":
         return criterion
     if criterion == "mean-square":
-        message = (
-            "--criterion mean-square and --hands passive don't go together: hands draw from the "
-            "nominal network"
-        )
+        message = "--criterion mean-square is not available with --hands passive (nominal network only)"
         raise ApcError(
-            Diagnostic("E930", SourceLocation("--hands"), message, hint="--criterion nominal --hands passive")
+            Diagnostic("E930", SourceLocation("--hands"), message, fix="--criterion nominal --hands passive")
         )
     return "passive"
 
 
 class Command(click.Command):
-    """A command that says with --timings how long each of its parts took."""
+    """A command with the options --timings and, where it prints a result, --digits."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Parse the words of a command line. Raises click.UsageError with the present name of a former
@@ -166,14 +163,17 @@ class Command(click.Command):
             present = (OPTIONS[""] | OPTIONS.get(self.name or "", {})).get(error.option_name)
             if not any(present in parameter.opts for parameter in self.params):
                 raise
-            message = f"{error.option_name} is named {present} now."
+            message = f"unknown option {error.option_name}; its present name is {present}."
             raise click.UsageError(message, ctx) from None
 
     def invoke(self, ctx: click.Context) -> Any:
         """Run the command with one thread of each library, its parts measured if that is asked for."""
         start_single_threaded()
-        if not ctx.params.pop("timings"):
-            return super().invoke(ctx)
+        with full_digits() if ctx.params.pop("digits", "") == "full" else contextlib.nullcontext():
+            return self._timed(ctx) if ctx.params.pop("timings") else super().invoke(ctx)
+
+    def _timed(self, ctx: click.Context) -> Any:
+        """Run the command and print the time of each part at the end."""
         started = time.process_time()
         with record() as timings:
             try:
@@ -199,18 +199,18 @@ class WholeNumber(click.IntRange):
 def print_result(
     result: Result, *, as_json: bool, written: Iterable[Path | None] = (), before: str | None = "\n"
 ) -> None:
-    """Print a result, as one JSON document or in words, and which files of it are written.
+    """Print a result, as text or as one JSON document, and the names of its files.
 
     Parameters
     ----------
     result
         The result.
     as_json
-        Whether as JSON, which goes alone.
+        Whether to print JSON, without other text.
     written
-        The files, None for those not asked for; if one is stdout all is printed on stderr.
+        The written files, or None; if one is stdout, the text is printed on stderr.
     before
-        What stands before the name of a file; None where the result names it itself.
+        The text before the name of a file; None where the result names the file itself.
     """
     files = [path for path in written if path is not None]
     err = prints_to_stderr(*files)
@@ -220,21 +220,21 @@ def print_result(
 
 
 def prints_to_stderr(*outputs: Path | None) -> bool:
-    """Return whether what is printed goes to stderr, as one of the files written is stdout."""
+    """Return whether texts are printed on stderr, because an output file is stdout."""
     return any(output is not None and is_stdout(output) for output in outputs)
 
 
 def note_aside(text: str) -> None:
-    """Print a note on what was asked, beside the answer."""
+    """Print a note on stderr."""
     echo(f"note: {text}", err=True)
 
 
 def note_typical_hand(hands: str) -> None:
-    """Say of a hand of the library that its usual values stand for the range that was measured."""
-    from apc.frame.devices import HANDS
+    """Print a note that the typical values of a library hand are used instead of the measured ranges."""
+    from apc.lifting.devices import HANDS
 
     if hands not in HANDS:
-        note_aside(f"{hands} by its usual values; apc analyze takes the range that was measured")
+        note_aside(f"{hands}: typical values are used; apc analyze uses the measured ranges")
 
 
 def echo(text: str, *, err: bool = False) -> None:
@@ -243,7 +243,7 @@ def echo(text: str, *, err: bool = False) -> None:
 
 
 def timings_text(timings: Mapping[str, float]) -> str:
-    """Return what --timings says: parts and their seconds."""
+    """Return the table of --timings: the steps and their durations."""
     rows = [*timings.items(), ("all", sum(timings.values()))]
     width = max(len(name) for name, _ in rows)
     return "\n".join(f"  {name:<{width}}  {seconds * 1e3:8.1f} ms" for name, seconds in rows)

@@ -1,9 +1,9 @@
-"""What long work shows on a terminal while it goes on: a bar, or a line in words.
+"""The progress of a long computation, on a terminal as a bar or a line.
 
-Takes: how far the work is. Gives: `Bar`, `progress_bar`, `status_line`, `at_work`.
-Guarantees: all of it goes to stderr, and is gone from a terminal when the work ends, however it ends; what is
-no terminal is told of long work alone, in a line now and then.
-Does not: slow the work down: what draws a bar is loaded when one is shown.
+Takes: the completed amount of work. Gives: `Bar`, `progress_bar`, `status_line`, `at_work`.
+Guarantees: all text goes to stderr, and is removed from a terminal at the end of the work, also after an
+error. A pipe or file receives a line at increasing intervals, only for long work.
+Does not: slow the work down: the library of the bar is loaded when a bar is shown.
 """
 
 from __future__ import annotations
@@ -17,51 +17,51 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from apc.compiler.errors import visible
-from apc.compiler.wording import time_left
+from apc.support.remaining_time import RemainingTime
 
 LONG = 1.0  # seconds of work after which a bar is shown
 
-# Seconds of work after which what is no terminal is told how far it is, and again each time it has gone on
-# for twice as long: a log of a day's work has a dozen lines of it.
+# Seconds of work before the first line in a pipe or file. Each further line is printed after twice the time:
+# the log of one day of work has a dozen lines.
 QUIET = 10.0
 
-# Is told how much is done, and of how much.
+# Receives the completed amount and the total.
 Bar = Callable[[float, float], None]
 
 
 @contextmanager
 def progress_bar(title: str, unit: str, *, after: float = LONG) -> Iterator[Bar]:
-    """Give a function that shows on a terminal how much is done, once the work takes long.
+    """Yield a function that shows the completed amount of long work.
 
     Parameters
     ----------
     title
-        What is being done, in a word.
+        The name of the work.
     unit
-        What is counted.
+        The unit of the amount.
     after
-        Seconds of work after which it is shown.
+        Seconds of work before a bar is shown on a terminal.
     """
+    remaining = RemainingTime()
     if not sys.stderr.isatty():
-        begun, write = time.monotonic(), _now_and_then()
-        yield lambda done, total: write(
-            lambda: (
-                f"{title}: {done:,.6g} of {total:,.6g} {unit}"
-                + time_left(time.monotonic() - begun, done, total)
-            )
-        )
+        write = _at_intervals()
+
+        def print_line(done: float, total: float) -> None:
+            times = remaining.text(done, total)
+            write(lambda: f"{title}: {done:,.6g} of {total:,.6g} {unit}, {times}")
+
+        yield print_line
         return
     from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+    from rich.progress import BarColumn, Progress, TextColumn
 
     columns = (
         TextColumn(title),
         BarColumn(),
-        TextColumn(f"{{task.fields[of]}} {unit}"),
-        TimeRemainingColumn(),
+        TextColumn(f"{{task.fields[of]}} {unit}, {{task.fields[times]}}"),
     )
     plotted = Progress(*columns, console=Console(stderr=True), transient=True)
-    task = plotted.add_task(title, total=None, of="")
+    task = plotted.add_task(title, total=None, of="", times="")
     begun, shown = time.monotonic(), False
 
     def show(done: float, total: float) -> None:
@@ -69,7 +69,8 @@ def progress_bar(title: str, unit: str, *, after: float = LONG) -> Iterator[Bar]
         if not shown and time.monotonic() - begun > after:
             plotted.start()
             shown = True
-        plotted.update(task, completed=done, total=total, of=f"{done:,.6g} of {total:,.6g}")
+        of, times = f"{done:,.6g} of {total:,.6g}", remaining.text(done, total)
+        plotted.update(task, completed=done, total=total, of=of, times=times)
 
     try:
         yield show
@@ -80,10 +81,10 @@ def progress_bar(title: str, unit: str, *, after: float = LONG) -> Iterator[Bar]
 
 @contextmanager
 def status_line() -> Iterator[Callable[[str], None]]:
-    """Give a function that writes what is being done over what it wrote before."""
+    """Yield a function that prints the current step; on a terminal each text replaces the last."""
     if not sys.stderr.isatty():
-        spoken = _now_and_then()
-        yield lambda text: spoken(lambda: text)
+        write_line = _at_intervals()
+        yield lambda text: write_line(lambda: text)
         return
 
     def write(text: str) -> None:
@@ -98,22 +99,21 @@ def status_line() -> Iterator[Callable[[str], None]]:
 
 @contextmanager
 def at_work(title: str, *, about: float = 0.0) -> Iterator[None]:
-    """Say on stderr, while work of unknown length goes on, that it does: after `QUIET`, then ever rarer.
+    """Print the elapsed time of work of unknown length: first after `QUIET`, then after twice the time.
 
     Parameters
     ----------
     title
-        What is being done, in a few words.
+        The name of the work.
     about
-        Seconds it will take, as far as is known: said first if it is long.
+        The estimated time in seconds, printed at the start if it is long.
     """
     if about > QUIET:
-        sys.stderr.write(f"{visible(title)}: this may take {about:,.0f} s\n")
+        sys.stderr.write(f"{visible(title)}: estimated time {about:,.0f} s\n")
     if not math.isfinite(QUIET):
         yield
         return
     ended = threading.Event()
-    # Never longer than the work: a thread that only waits.
     watching = threading.Thread(target=_watch, args=(title, ended.wait), daemon=True)
     watching.start()
     try:
@@ -124,16 +124,16 @@ def at_work(title: str, *, about: float = 0.0) -> Iterator[None]:
 
 
 def _watch(title: str, ended: Callable[[float], bool]) -> None:
-    """Say now and then that work goes on, until `ended` says after some seconds that it doesn't."""
+    """Print the elapsed time at increasing intervals; `ended` waits, and returns true at the end."""
     gone = QUIET
     while not ended(gone if gone == QUIET else gone / 2):
-        sys.stderr.write(f"{visible(title)}: at work for {gone:,.0f} s\n")
+        sys.stderr.write(f"{visible(title)}: {gone:,.0f} s elapsed\n")
         sys.stderr.flush()
         gone *= 2
 
 
-def _now_and_then() -> Callable[[Callable[[], str]], None]:
-    """Return what writes a line to what is no terminal: first after `QUIET`, then after twice as long, …."""
+def _at_intervals() -> Callable[[Callable[[], str]], None]:
+    """Return a function that writes a line to a pipe or file after `QUIET`, then after twice the time."""
     begun, following = time.monotonic(), QUIET
 
     def write(text: Callable[[], str]) -> None:

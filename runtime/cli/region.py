@@ -1,4 +1,4 @@
-"""The command `region`: what it takes and what it prints.
+"""The command `apc region`.
 
 Takes: words of a command line. Gives: the click command `region_command`.
 Guarantees: with --json, stdout holds one JSON document and nothing else; a file that can't be written is
@@ -29,36 +29,30 @@ from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 def region_command(
     *,
     file: str | None,
-    x: str | None = option("Horizontal axis; the topology's studies: region: if not given.", "PATH=LO:HI"),
-    y: str | None = option("Vertical axis.", "PATH=LO:HI"),
-    compare: tuple[str, ...] = option("Another topology in the same picture. May be repeated.", "FILE"),
-    vary: str | None = option("A panel a value: lan.delay=0,8 ms.", "PATH=V1,V2,…"),
+    x: str | None = option("Horizontal axis.", "PATH=LO:HI", show_default="studies: region"),
+    y: str | None = option("Vertical axis.", "PATH=LO:HI", show_default="studies: region"),
+    compare: tuple[str, ...] = option("Topology to compare with (repeatable).", "FILE"),
+    vary: str | None = option("One panel per value, e.g. lan.delay=0,8 ms.", "PATH=V1,V2,…"),
     panels: tuple[str, ...] = option(
-        "A panel with several values at once; repeat it for (a), (b), ….", '"PATH=V, …"', name="--panel"
+        "One panel with several values (repeatable).", '"PATH=V, …"', name="--panel"
     ),
-    normalize: bool = option(
-        "Compare at equal effective gain: where a topology sums over its others, y counts once an other."
-    ),
+    normalize: bool = option("Multiply the gain y of a sum by the number of other peers."),
     overlays: tuple[str, ...] = option(
-        "Draw a published condition too; every symbol is given a parameter or a quantity.",
-        "CONDITION:SYMBOL=PATH,…",
+        "Draw a published condition; each symbol is a parameter or quantity.",
+        "NAME:SYMBOL=PATH,…",
         name="--overlay",
     ),
     settings: tuple[str, ...],
-    cells: int = option(
-        "Cells along each side of the rectangle to begin with.",
-        type=WholeNumber(2, 256),
-        default=12,
-    ),
+    cells: int = option("Initial cells along each side.", "N", type=WholeNumber(2, 256), default=12),
     criterion: str | None,
     hands: str,
     out: Path | None = result_option(),
     as_json: bool,
 ) -> None:
-    """Find the stable region of two parameters, as exact curves.
+    """Compute the stability region of two parameters.
 
-    FILE is a topology or a compiled model. Every curve comes with the mode
-    that makes it, that mode's frequency, and an error.
+    Each boundary curve is exact: it has a mode, a frequency and an error bound.
+    FILE is a topology or a compiled model.
 
     \b
         apc region --x "contact.stiffness=10 N/m:3000 N/m" \\
@@ -66,12 +60,12 @@ def region_command(
                    --compare mesh.yaml --vary "lan.delay=0,8 ms" \\
                    --out regions.svg
     """
-    from apc.inputs import open_topology
+    from apc.inputs.open_model import open_topology
     from apc.output.pictures import write_result
     from apc.regions.panels import compare_regions, parse_panel, parse_vary
 
     if vary and panels:
-        message = "--vary and --panel both say what the panels are: one of them is enough"
+        message = "--vary can't be combined with --panel"
         raise ApcError(Diagnostic("E907", SourceLocation("region"), message))
     listed = parse_vary(vary) if vary else tuple(parse_panel(text) for text in panels) or ((),)
     requested = criterion_with(hands, criterion)

@@ -1,8 +1,8 @@
 """The command `apc report`.
 
-Takes: words of a command line. Gives: a page, or what differs from one.
-Guarantees: a file that can't be written is refused before anything is computed, and is there whole or not at
-all.
+Takes: words of a command line. Gives: a page, or the differences from a page.
+Guarantees: a file that can't be written is refused before anything is computed, and is written completely or
+not at all.
 Does not: compute.
 """
 
@@ -30,30 +30,29 @@ def report_command(
     *,
     files: tuple[str, ...] = argument(nargs=-1, metavar="[FILE...]"),
     settings: tuple[str, ...],
-    out: Path | None = option("Write the page here: .html, or .pdf by Chromium."),
-    check: Path | None = option("Compute the numbers of a report.html anew, and say what differs.", "REPORT"),
+    out: Path | None = option("Output file (.html, or .pdf with Chromium)."),
+    check: Path | None = option("Recompute a report.html and list the differences.", "REPORT"),
 ) -> None:
-    """Gather all that is known of topologies in one page.
+    """Write a report of topologies as one page.
 
-    One file that opens anywhere and loads nothing: the topology's picture and
-    text, what was compiled, the verdict with its bound and proof, modes,
-    margins, the stable region, what happens over time, how much may get lost,
-    what a hand feels; beside each picture what the command says that makes it,
-    and what versions and texts made it. Several FILEs stand side by side.
+    The page is self-contained. It shows picture, text, verdict with proof,
+    modes, margins, stability region, simulation, loss limits and impedance,
+    each with the command that reproduces it. Several FILEs are shown in
+    columns.
 
     \b
         apc report average.yaml mesh.yaml --out report.html
         apc report --check report.html
     """
     if (out is None) == (check is None):
-        raise click.UsageError("--out FILE writes a report, --check REPORT reads one: one of them")
+        raise click.UsageError("one of --out FILE and --check REPORT is required")
     if check is not None:
         if files or settings:
-            raise click.UsageError("--check computes what the report itself says: no FILE or --set with it")
+            raise click.UsageError("--check can't be combined with FILE or --set")
         _check(check)
         return
     assert out is not None
-    from apc.inputs import check_topology_outputs, find_input, refuse_model
+    from apc.inputs.open_model import check_topology_outputs, find_input, refuse_model
     from apc.output.report_output import check_report_path, save_report
     from apc.reports.contents import report
 
@@ -62,7 +61,7 @@ def report_command(
     for path in paths:
         refuse_model(path, "report")
         check_topology_outputs(path, {"--out": out})
-    with at_work("reporting"):
+    with at_work("writing the report"):
         result = report(paths, settings)
         save_report(result, out)
     echo(str(result))
@@ -70,7 +69,7 @@ def report_command(
 
 
 def _check(path: Path) -> None:
-    """Compute a report anew. Raises ApcError (E991) with everything that differs."""
+    """Recompute a report. Raises ApcError (E991) with all differences."""
     import tempfile  # most commands need none
 
     from apc.output.report_output import damaged, read_page, topology_again
@@ -78,7 +77,7 @@ def _check(path: Path) -> None:
 
     read = read_page(path)
     mistakes, notes = list[Diagnostic](), list[str]()
-    with tempfile.TemporaryDirectory(prefix="apc-report-") as folder, at_work("reporting"):
+    with tempfile.TemporaryDirectory(prefix="apc-report-") as folder, at_work("writing the report"):
         topologies = []
         for k, item in enumerate(read.stored["topologies"]):
             topologies.append(topology_again(item, Path(folder, str(k))))
@@ -95,27 +94,25 @@ def _check(path: Path) -> None:
         made, texts = dict(topology.origin), dict(item["texts"])
         changed = [name for name, digest in item["origin"] if made.get(name) != digest]
         mistakes += [
-            Diagnostic("E991", location, f"the SHA-256 of {name[:80]} is not that of its text")
+            Diagnostic("E991", location, f"SHA-256 of {name[:80]} does not match its text")
             for name in changed
             if name in texts
         ]
-        notes += [
-            f"{name} is another one than the report was made with" for name in changed if name not in texts
-        ]
+        notes += [f"{name} has changed since the report was written" for name in changed if name not in texts]
     was = read.stored["versions"]
     other = [(name, now) for name, now in repeated.versions if was.get(name) != now]
-    notes += [f"{name} was {was.get(name, 'not there')}, and is {now} here" for name, now in other]
+    notes += [f"{name}: {was.get(name, 'none')} in the report, {now} here" for name, now in other]
     for text in dict.fromkeys(notes):
         echo(f"note: {text}", err=True)
     if lines or mistakes:
         raise ApcError([*lines, *mistakes])
-    echo(f"{path}: every number is the same, computed anew")
+    echo(f"{path}: all numbers reproduced")
 
 
 def _lines_that_differ(path: Path, read: StoredPage, repeated: Report) -> Iterator[Diagnostic]:
-    """Yield what the page shows that it would not show if rendered from the report computed anew.
+    """Yield the lines of the page that differ from a page rendered from the recomputed report.
 
-    Versions and digests are shown as the page holds them; where they differ here, a note says so.
+    Versions and digests are those of the page; a note is printed if they differ from the present ones.
     """
     from dataclasses import replace
 
@@ -130,8 +127,8 @@ def _lines_that_differ(path: Path, read: StoredPage, repeated: Report) -> Iterat
     expected, json = split_page(report_page(replace(repeated, topologies=topologies, versions=versions)))
     differences = [*line_differences(read.shown, expected, exact=json == read.json)]
     for each in differences[:MOST_LINES]:
-        message = f"shows {each.shown!r}, but computed anew it is {each.expected!r}"
-        yield Diagnostic("E991", SourceLocation(str(path), each.line, 1), message)
+        location = SourceLocation(str(path), each.line, 1)
+        yield Diagnostic("E991", location, "line", repr(each.expected), repr(each.shown))
     if len(differences) > MOST_LINES:
         yield Diagnostic(
             "E991", SourceLocation(str(path)), f"{len(differences) - MOST_LINES:,} more lines differ"
@@ -139,19 +136,19 @@ def _lines_that_differ(path: Path, read: StoredPage, repeated: Report) -> Iterat
 
 
 def _differs(stored_topology: StoredTopology, now: Mapping[str, Any]) -> Iterator[str]:
-    """Yield what differs between the sections of a topology that a report keeps and those made anew."""
+    """Yield the differences between stored and recomputed sections of a topology."""
     from apc.output.report_output import TITLES
     from apc.reports.contents import differences
 
     for key in ("name", "description"):
         if stored_topology[key] != now[key]:
-            yield f"{key} is {now[key]}, not {stored_topology[key]}"
+            yield f"{key}: expected {now[key]}, got {stored_topology[key]}"
     before = {item["key"]: item for item in stored_topology["sections"]}
     for section in now["sections"]:
         title, old = TITLES[section["key"]], before.get(section["key"])
         if old is None:
-            yield f"{title} is not in it"
+            yield f"section {title} is missing"
         elif old["refused"] != section["refused"]:
-            yield f"{title}: {section['refused'] or 'there is one'}, not: {old['refused'] or 'there is one'}"
+            yield f"{title}: expected {section['refused'] or 'a result'}, got {old['refused'] or 'a result'}"
         else:
             yield from (f"{title}: {subject}" for subject in differences(old["results"], section["results"]))

@@ -25,44 +25,37 @@ def run_command(
     file: str | None,
     duration: str | None,
     settings: tuple[str, ...],
-    peer: str | None = option("Play this peer alone, such as left[1]; all of them if not given.", "PEER"),
-    listen: str | None = option("Where this peer listens.", "HOST:PORT"),
-    to: tuple[str, ...] = option("Where another peer is. Repeated for each.", "PEER=HOST:PORT"),
-    emulate: bool = option(
-        "Hold back and lose packets at the sender, as the topology's links say, beside what the network does."
-    ),
-    seed: int | None = seed_option("that --emulate loses"),
-    device: Path | None = option(
-        "A device in the place of this peer's simulated one: a function device(time, force) in a .py file, "
-        "double apc_device(double, const double *) in a .so."
-    ),
-    secret_file: Path | None = option("What only the peers know: datagrams without it are dropped."),
-    patience: str = option("For the others.", '"TIME"', name="--wait", default="30 s"),
-    out: Path | None = option("Where the run is kept; NAME.run for NAME.yaml.", "FOLDER"),
+    peer: str | None = option("Run this peer only.", "PEER", show_default="all peers"),
+    listen: str | None = option("Address of this peer.", "HOST:PORT"),
+    to: tuple[str, ...] = option("Address of another peer (repeatable).", "PEER=HOST:PORT"),
+    emulate: bool = option("Emulate delay and loss of the links."),
+    seed: int | None = seed_option(),
+    device: Path | None = option("Driver of the device: device(time, force) in .py, or apc_device in .so."),
+    secret_file: Path | None = option("Shared secret; other packets are dropped."),
+    patience: str = option("Time to wait for the other peers.", '"TIME"', name="--wait", default="30 s"),
+    out: Path | None = option("Folder of the recording.", "FOLDER", show_default="NAME.run"),
     as_json: bool,
 ) -> None:
-    """Play a topology in real time, over a network.
+    """Run a topology in real time over UDP.
 
-    Each peer ticks at its clocks, with its simulated device, and hears what
-    has arrived. What was sent, heard and when is kept in a folder, NAME.run;
-    `apc compare NAME.run` lays it beside what simulate and analyze say.
-    Without --peer all peers are played on this machine.
+    Each peer runs at its clocks, with a simulated device unless --device is
+    given. Without --peer all peers run on this machine. The recording is a
+    folder NAME.run; apc compare NAME.run compares it with simulation and
+    analysis. Hosts need clocks synchronized by NTP or PTP: a constant offset is
+    removed at the start, drift is not.
 
     \b
         apc run topology.yaml --duration "60 s" --emulate
         apc run topology.yaml --peer "left[1]" --listen 192.0.2.1:5000 \\
                             --to "right[1]=192.0.2.2:5000"
-
-    Hosts that play together keep their clocks by NTP or PTP: how far apart
-    they are when the peers meet is taken off, what they drift is not.
     """
-    from apc.inputs import find_input, open_topology
-    from apc.option_value import option_value
+    from apc.inputs.open_model import find_input, open_topology
     from apc.realtime.device import device_function
     from apc.realtime.peer_run import check_folder, write_run
     from apc.realtime.run_folder import read_run
     from apc.realtime.start import LocalRun, run_all, run_single
     from apc.simulation.trajectory import duration_of, parse_duration
+    from apc.support.option_value import option_value
 
     path = find_input(file, compiled_too=True)
     folder = out or Path(f"{path.stem}.run")
@@ -77,18 +70,18 @@ def run_command(
     )
     if how.patience < 0:
         raise ApcError(
-            Diagnostic("E207", SourceLocation("--wait"), "the time", "0 s or more", patience, '--wait "30 s"')
+            Diagnostic("E207", SourceLocation("--wait"), "time", "0 s or more", patience, '--wait "30 s"')
         )
     check_folder(folder, path)
     if peer is None:
         if listen or to or device:
-            raise click.UsageError("--listen, --to and --device are of one peer: --peer says which")
-        with at_work("playing"):
+            raise click.UsageError("--listen, --to and --device require --peer")
+        with at_work("running"):
             parts = run_all(system, how)
     else:
         listening, addresses = _addresses(listen, to, has_secret=bool(how.secret))
         outside = None if device is None else device_function(device)
-        with at_work("playing"):
+        with at_work("running"):
             parts = (run_single(system, peer, listening, addresses, how, device=outside),)
     troubles = [mistake for part in parts if part.trouble for mistake in part.trouble.mistakes]
     played = [part.run for part in parts if part.run is not None]
@@ -96,7 +89,7 @@ def run_command(
         write_run(folder, system, played, whole=peer is None)
     if troubles:
         if played:
-            note_aside(f"{folder} holds what was played until then")
+            note_aside(f"{folder} contains the recording up to the error")
         raise ApcError(troubles)
     if not played:
         raise KeyboardInterrupt
@@ -105,7 +98,7 @@ def run_command(
 
         print_result(compare_run(read_run(folder)), as_json=as_json)
     if not as_json:
-        echo(f"\n{folder} holds the run; apc compare {folder}")
+        echo(f"\n{folder} is written. Next: apc compare {folder}")
 
 
 def _secret(path: Path | None) -> bytes:
@@ -122,12 +115,12 @@ def _secret(path: Path | None) -> bytes:
         ) from None
     file = shlex.quote(str(path))
     if os.name == "posix" and path.stat().st_mode & 0o077:
-        message = f"{path} may be read by other users of this machine"
-        raise ApcError(Diagnostic("E974", SourceLocation("--secret-file"), message, hint=f"chmod 600 {file}"))
+        message = f"{path} is readable by other users"
+        raise ApcError(Diagnostic("E974", SourceLocation("--secret-file"), message, fix=f"chmod 600 {file}"))
     if len(secret) < SHORTEST:
-        hint = f"(umask 077; head -c 32 /dev/urandom | base64 > {file})"
+        fix = f"(umask 077; head -c 32 /dev/urandom | base64 > {file})"
         expected, got = f"{SHORTEST} bytes or more", str(len(secret))
-        raise ApcError(Diagnostic("E974", SourceLocation("--secret-file"), "a secret", expected, got, hint))
+        raise ApcError(Diagnostic("E974", SourceLocation("--secret-file"), "secret", expected, got, fix))
     return secret
 
 
@@ -142,22 +135,18 @@ def _addresses(listen: str | None, to: tuple[str, ...], *, has_secret: bool):  #
     for text in to:
         name, equals, address = (item.strip() for item in text.partition("="))
         if not (equals and name):
-            expected, hint = "PEER=HOST:PORT", '--to "right[1]=192.0.2.7:5000"'
+            expected, fix = "PEER=HOST:PORT", '--to "right[1]=192.0.2.7:5000"'
             raise ApcError(
-                Diagnostic(
-                    "E971", SourceLocation("--to"), "an address", expected, text[:80] or "nothing", hint
-                )
+                Diagnostic("E971", SourceLocation("--to"), "address", expected, text[:80] or "nothing", fix)
             )
         if name in others:
-            message = f"{name} is given twice"
+            message = f"two addresses of {name}"
             raise ApcError(
-                Diagnostic("E971", SourceLocation("--to"), message, hint=f'--to "{name}={address}"')
+                Diagnostic("E971", SourceLocation("--to"), message, fix=f'--to "{name}={address}"')
             )
         others[name] = address_of(address, "--to", name)
     pair = address_of(listen, "--listen") if listen else (LOOPBACK, 0)
     socket = listen_at(pair)
     if not is_loopback(pair) and not has_secret:
-        note_aside(
-            "packets carry no secret: whoever can send from a peer's address can play it; --secret-file"
-        )
+        note_aside("packets are not authenticated; --secret-file FILE authenticates them")
     return socket, others

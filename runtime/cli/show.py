@@ -15,7 +15,7 @@ import click
 from apc.cli.options import command, echo, option, prints_to_stderr
 from apc.compiler.files import write_text
 from apc.output.formatting import json_text
-from apc.suffixes import check_suffix
+from apc.support.suffixes import check_suffix
 
 FORMATS = {".txt": "text", ".json": "json", ".dot": "dot", ".gv": "dot", ".mmd": "mermaid", ".svg": "svg"}
 FORMATS |= {".png": "picture", ".pdf": "picture"}
@@ -27,22 +27,23 @@ def show_command(
     *,
     file: str | None,
     format_: str | None = option(
-        "text: graph, equations, schedule. json: the same as one document. dot, mermaid: the graph for "
-        "Graphviz and Mermaid. svg: the graph as a picture. Taken from --out if not given, else text.",
+        "text, json, dot (Graphviz), mermaid or svg.",
+        "FORMAT",
         name="--format",
         type=click.Choice(["text", "json", "dot", "mermaid", "svg"]),
+        show_default="from --out, else text",
     ),
-    parameters: bool = option("List what may be set instead: names, values, units, limits; as text or json."),
-    out: Path | None = option("Write to this file: .txt .json .dot .mmd, or as a picture .svg .png .pdf."),
+    parameters: bool = option("List the parameters: names, values, units, limits."),
+    out: Path | None = option("Output file (.txt .json .dot .mmd .svg .png .pdf)."),
 ) -> None:
-    """Show what a topology is made of: its graph, equations and schedule.
+    """Show the graph, equations and schedule of a topology.
 
-    The graph has the parts of one peer and how they are joined, and the
-    peers and the links between them. The schedule says what ticks when, how
-    long what it computes is held, and which packets are on their way.
+    The graph has the parts and connections of one peer, the peers, and the
+    links between them. The schedule has the clocks, hold times, and packets in
+    transit. The equations in order of computation: apc compile --until sorted.
     """
     from apc.api import show as shown
-    from apc.inputs import check_topology_outputs, find_input
+    from apc.inputs.open_model import check_topology_outputs, find_input
 
     requested = format_ or "text"
     formats = {name: of for name, of in FORMATS.items() if not parameters or of in ("text", "json")}
@@ -67,12 +68,12 @@ def show_command(
 
 
 def _show_parameters(file: str | None, requested: str, out: Path | None) -> None:
-    """List what may be set of a topology."""
-    from apc.frame.parameter_listing import parameters
-    from apc.inputs import open_topology
+    """List the parameters of a topology."""
+    from apc.inputs.open_model import open_topology
+    from apc.parameter_values.parameter_listing import parameters
 
     if requested not in ("text", "json"):
-        raise click.UsageError("--parameters is a table: --format text or json")
+        raise click.UsageError("--parameters requires --format text or json")
     result = parameters(open_topology(file, (), {"--out": out}))
     _print_or_write(json_text(result.to_dict()) if requested == "json" else str(result), out)
 
@@ -80,17 +81,17 @@ def _show_parameters(file: str | None, requested: str, out: Path | None) -> None
 @command
 def schema_command(
     *,
-    out: Path | None = option("Write to this file instead of the terminal."),
+    out: Path | None = option("Output file.", show_default="stdout"),
 ) -> None:
-    """Print the JSON Schema of topologies, for editors.
+    """Print the JSON Schema of topologies.
 
-    An editor that knows YAML schemas completes and checks a topology whose
-    first line is, with the schema beside it as topology.schema.json,
+    For completion in an editor, store the schema in the folder of a topology as
+    topology.schema.json. The first line of the topology is then
 
     \b
         # yaml-language-server: $schema=topology.schema.json
 
-    `apc new` writes that line where the schema is.
+    `apc new` writes this line if the schema exists.
     """
     from apc.api import schema as generated
 

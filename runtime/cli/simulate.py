@@ -1,8 +1,8 @@
-"""The command `simulate`: what it takes, what it prints, how it is interrupted.
+"""The command `apc simulate`.
 
 Takes: words of a command line. Gives: the click command `simulate_command`.
-Guarantees: with --json, stdout holds one JSON document and nothing else; progress goes to a terminal only;
-Ctrl-C ends the run and keeps what is done.
+Guarantees: with --json, stdout holds one JSON document and nothing else; the progress is printed on stderr;
+Ctrl-C ends the run; completed rows are stored.
 Does not: compute.
 """
 
@@ -28,7 +28,7 @@ from apc.cli.options import (
 from apc.cli.progress import progress_bar
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.files import partial_name
-from apc.suffixes import check_suffix
+from apc.support.suffixes import check_suffix
 
 if TYPE_CHECKING:
     from apc.compiler.compiled import Model
@@ -45,45 +45,35 @@ def simulate_command(
     duration: str | None,
     settings: tuple[str, ...],
     signals: tuple[str, ...] = option(
-        "Record only what fits, such as cube.x, 'left[2].*' or '*.v'. May be repeated.", "PATTERN"
+        "Signals to record: cube.x, 'left[2].*', '*.v' (repeatable).", "PATTERN", show_default="all"
     ),
-    out: Path | None = option(
-        "Write the rows to this file: .csv, .parquet, .mat or .npz; or what moves: .gif, .mp4."
-    ),
-    plot: Path | None = picture_option("Draw them, a panel a quantity: .png, .svg or .pdf."),
-    snapshot: Path | None = picture_option(
-        "Draw how it begins, the peers' bodies side by side: .png, .svg or .pdf."
-    ),
+    out: Path | None = option("Output file: rows (.csv .parquet .mat .npz) or animation (.gif .mp4)."),
+    plot: Path | None = picture_option("Plot the signals (.png, .svg, .pdf)."),
+    snapshot: Path | None = picture_option("Draw the initial state (.png, .svg, .pdf)."),
     as_json: bool,
-    no_jit: bool = option("Don't compile to machine code."),
-    seed: int | None = seed_option("that get lost or come late"),
+    no_jit: bool = option("Disable compilation to machine code."),
+    seed: int | None = seed_option(),
     runs: int | None = option(
-        "Play it so often, with other packets each time, and say what that amounts to.",
-        "NUMBER",
-        type=WholeNumber(1, 10_000_000),
+        "Number of runs with random losses and delays.", "N", type=WholeNumber(1, 10_000_000)
     ),
-    jobs: int = option("Processes that share the runs.", "NUMBER", type=WholeNumber(1, 1024), default=1),
+    jobs: int = option("Number of processes for --runs.", "N", type=WholeNumber(1, 1024), default=1),
     method: str | None = option(
-        "exact, rk4:STEP, semi-implicit:STEP or cvodes:RTOL; exact where linear and CVODES elsewhere if "
-        "not given.",
+        "exact, rk4:STEP, semi-implicit:STEP or cvodes:RTOL.",
         "METHOD",
+        show_default="exact; cvodes if nonlinear",
     ),
-    impulse: str | None = option(
-        'Strike a peer as it begins, such as "user[1]": its device starts at 0.1 m/s.', "PEER"
-    ),
+    impulse: str | None = option("Start the device of a peer at 0.1 m/s.", "PEER"),
     trace_of: str | None = option(
-        "Lose packets by the periodic pattern that analyze finds to shake the topology.",
-        type=click.Choice(["worst"]),
+        "Use the worst periodic loss pattern of analyze.", type=click.Choice(["worst"])
     ),
-    error: bool = option("Play it a second time, more closely, and say how far off it is."),
+    error: bool = option("Estimate the error with a more accurate run."),
 ) -> None:
-    """Play a topology in time.
+    """Simulate a topology in time.
 
-    FILE is a topology or a compiled model. Devices move by their exact
-    transition from event to event, forces are computed at their ticks,
-    packets arrive when they are due; there is no step size. What is not
-    linear between the ticks is integrated by CVODES. A row is written for
-    every tick of the fastest clock, with the values before the tick.
+    Linear dynamics follow the exact transition between events, without step
+    size; CVODES integrates nonlinear dynamics. Each tick of the fastest clock
+    gives one row, with the values before the tick. FILE is a topology or a
+    compiled model.
 
     \b
         apc simulate --duration "3 s" --plot run.png
@@ -93,12 +83,12 @@ def simulate_command(
         apc simulate --runs 1000 --seed 1 --jobs 4
         apc simulate --method semi-implicit:1ms --error
     """
-    from apc.inputs import open_topology
+    from apc.inputs.open_model import open_topology
     from apc.simulation.settings import DEFAULT, Settings, parse_method
     from apc.simulation.trajectory import duration_of, parse_duration
 
     if runs is not None and (signals or out or plot or error):
-        raise click.UsageError("--runs keeps no rows: --signals, --out, --plot and --error are for one run")
+        raise click.UsageError("--runs can't be combined with --signals, --out, --plot or --error")
     chosen = parse_method(method) if method is not None else DEFAULT
     requested = parse_duration(duration) if duration is not None else None
     if out is not None:
@@ -107,9 +97,9 @@ def simulate_command(
         file, settings, {"--out": out, "--plot": plot, "--snapshot": snapshot}, notify=note_aside
     )
     if trace_of is not None:
-        from apc.mean_square.dropout_bounds import worst_trace
+        from apc.support.extension_table import require_extension
 
-        system = worst_trace(system)
+        system = require_extension("loss_models").worst_trace(system)
     if impulse is not None:
         from apc.simulation.initial_velocity import WATCHED, impulse_text
         from apc.simulation.initial_velocity import initial_velocity as struck
@@ -148,10 +138,10 @@ def _check_rows(out: Path) -> None:
     from apc.output.recording import SUFFIXES
 
     if out.suffix.lower() in FORMATS:
-        message, known = "the suffix of --out", ", ".join((*SUFFIXES, *animation.SUFFIXES))
-        hint = f"--plot {out}"
+        message, known = "suffix of --out", ", ".join((*SUFFIXES, *animation.SUFFIXES))
+        fix = f"--plot {out}"
         raise ApcError(
-            Diagnostic("E878", SourceLocation(str(out)), message, f"one of {known}", out.suffix, hint)
+            Diagnostic("E878", SourceLocation(str(out)), message, f"one of {known}", out.suffix, fix)
         )
     if check_suffix(out, (*SUFFIXES, *animation.SUFFIXES), "--out") in animation.SUFFIXES:
         animation.check_animation(out)
@@ -186,7 +176,7 @@ def _simulate_single(system: Model, how: Settings, stored: _StoredRows, *, as_js
 
         moving = stored.out if stored.out.suffix.lower() in SUFFIXES else None
     if moving is not None and stored.signals:
-        raise click.UsageError(f"--signals chooses rows: a {moving.suffix} shows all that moves")
+        raise click.UsageError(f"--signals can't be combined with an animation ({moving.suffix})")
     simulation = prepare(system, how, signals=stored.signals)
     keeper = Keeper(simulation) if stored.plot is not None or moving is not None else None
     comparison = compare_with(simulation, signals=stored.signals) if stored.error else None
@@ -212,7 +202,7 @@ def _simulate_single(system: Model, how: Settings, stored: _StoredRows, *, as_js
     print_result(simulated, as_json=as_json, written=[out, plot, stored.snapshot], before="  ")
     if interrupted:
         until = f"{summary.end:g} s of {float(how.duration):g} s"
-        message = "what was done is kept" if out or not stored.out else f"{stored.out} was not begun"
+        message = "completed rows are stored" if out else "no rows are stored"
         echo(f"stopped at {until}; {message}", err=True)
         raise click.Abort
 
@@ -240,11 +230,11 @@ def _simulate_into(
             summary, interrupted = run_simulation(simulation, every, progress=lambda done: show(done, total))
         if recording is not None:
             recording.close(partial=interrupted)
-    except ApcError:  # the run can't go on: what was done is kept
+    except ApcError:  # the completed rows are stored
         if recording is not None:
             recording.close(partial=True)
             if recording.path != out:
-                echo(f"{recording.path} holds what was done; {out} is as it was", err=True)
+                echo(f"{recording.path} contains the completed rows; {out} is unchanged", err=True)
         raise
     except BaseException:
         if recording is not None:

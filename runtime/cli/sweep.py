@@ -1,8 +1,8 @@
-"""The command `sweep`: what it takes, what it prints, how it is interrupted.
+"""The command `apc sweep`.
 
 Takes: words of a command line. Gives: the click command `sweep_command`.
-Guarantees: with --json, stdout holds one JSON document and nothing else; progress goes to a terminal only;
-an interruption ends with what is kept, and says so.
+Guarantees: with --json, stdout holds one JSON document and nothing else; the progress is printed on stderr;
+after an interruption the number of stored points is printed.
 Does not: compute.
 """
 
@@ -25,7 +25,7 @@ from apc.cli.options import (
 from apc.cli.progress import Bar, progress_bar
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.files import is_special
-from apc.option_value import option_value
+from apc.support.option_value import option_value
 
 
 @command
@@ -33,46 +33,38 @@ def sweep_command(
     *,
     file: str | None,
     over: tuple[str, ...] = option(
-        "Vary a parameter: PATH='LOW:HIGH', 'LOW:HIGH:COUNT', 'LOW:HIGH:COUNT:log' or 'V1,V2,V3', with "
-        "units. May be repeated: every combination is computed, the last parameter turning fastest.",
+        "LOW:HIGH, LOW:HIGH:COUNT, LOW:HIGH:COUNT:log or V1,V2,… with units (repeatable).",
         "PATH=VALUES",
         required=True,
     ),
-    out: Path = option("Write the rows to this file, .parquet or .csv."),
-    of: str = option("What to compute at each point; see below.", "WHAT", default="analyze"),
+    out: Path = option("Output file (.parquet, .csv)."),
+    of: str = option("Result at each point: analyze or critical:PATH.", "WHAT", default="analyze"),
     criterion: str | None,
     hands: str,
     settings: tuple[str, ...],
-    jobs: int | None = option("Processes to compute with; all cores by default.", type=WholeNumber(min=1)),
-    cluster: str | None = option(
-        "Compute on a running Dask cluster instead: its scheduler's address, tcp://HOST:8786.", "ADDRESS"
-    ),
+    jobs: int | None = option("Number of processes.", "N", type=WholeNumber(min=1), show_default="all cores"),
+    cluster: str | None = option("Compute on a Dask cluster, tcp://HOST:8786.", "ADDRESS"),
     patience: str | None = option(
-        'End when nothing has come from processes or cluster for so long, such as "10 min"; wait for ever '
-        "if not given.",
-        '"TIME"',
+        "Abort after this time without a result.", '"TIME"', show_default="no limit"
     ),
     as_json: bool,
 ) -> None:
-    """Compute a result at every combination of parameter values.
+    """Compute a result over a grid of parameter values.
 
-    FILE is a topology or a compiled model. What is finished is kept beside
-    the target as it comes; a sweep that was stopped, however it was, is taken
-    up by the same command.
+    Every combination is computed; the last --over varies fastest. Finished
+    points are stored next to the output file, and the same command resumes an
+    interrupted sweep. analyze: verdict, spectral radius with error, rigid
+    modes, frequency and damping of the dominant mode. critical:PATH: the
+    stability limit of another parameter, with error.
 
     \b
         apc sweep --over contact.stiffness="100 N/m:3000 N/m:30" \\
                   --over links.lan.delay="0,8 ms" --out results.csv
-
-    WHAT is "analyze" (verdict, spectral radius per frame with its error,
-    rigid modes, frequency and damping of the leading mode) or
-    "critical:PATH" (the value of another parameter at which the verdict
-    changes, with its error).
     """
-    from apc.inputs import open_topology
-    from apc.processes import Patience
-    from apc.sweeps.resumable_sweep import sweep
-    from apc.tables import check_table_path
+    from apc.inputs.open_model import open_topology
+    from apc.studies.resumable_sweep import sweep
+    from apc.support.processes import Patience
+    from apc.support.tables import check_table_path
 
     check_table_path(out, "--out")
     waiting = Patience(_seconds(patience), lambda text: echo(text, err=True))
@@ -96,6 +88,7 @@ def sweep_command(
 
 
 def _seconds(patience: str | None) -> float | None:
+    """Return the time of `--patience` in seconds, None if it is not given. Raises ApcError E889."""
     if patience is None:
         return None
     value = float(option_value("--patience", patience, subject="patience", unit="s"))
@@ -118,14 +111,14 @@ def _values(over: tuple[str, ...]) -> dict[str, str]:
                 Diagnostic("E880", SourceLocation("sweep"), "--over", "PATH=VALUES", text[:80], form)
             )
         if name in result:
-            raise ApcError(Diagnostic("E883", SourceLocation("sweep"), f"{name[:80]} is swept twice"))
+            raise ApcError(Diagnostic("E883", SourceLocation("sweep"), f"two --over of {name[:80]}"))
         result[name] = values
     return result
 
 
 @contextmanager
 def _progress(out: Path) -> Iterator[Bar]:
-    """Give a function that shows progress on a terminal; say what is kept if the body doesn't end well."""
+    """Yield a function that shows the progress; after an exception print the number of stored points."""
     state = {"done": 0.0, "of": 0.0}
     try:
         with progress_bar("sweep", "points", after=0.0) as show:
@@ -137,6 +130,6 @@ def _progress(out: Path) -> Iterator[Bar]:
             yield progress
     except BaseException:
         if state["done"] > 0 and not is_special(out):
-            stored = f"{state['done']:,.0f} of {state['of']:,.0f} points are kept in {out}.parts"
-            echo(f"{stored}; the same command takes up from there", err=True)
+            stored = f"{state['done']:,.0f} of {state['of']:,.0f} points are stored in {out}.parts"
+            echo(f"{stored}; the same command resumes the sweep", err=True)
         raise

@@ -1,8 +1,8 @@
 """The command `apc tune`.
 
 Takes: words of a command line. Gives: text on stdout.
-Guarantees: with --json, stdout holds one JSON document and nothing else; how far the search is goes to a
-terminal only.
+Guarantees: with --json, stdout holds one JSON document and nothing else; the progress is
+printed on stderr.
 Does not: compute.
 """
 
@@ -37,54 +37,38 @@ if TYPE_CHECKING:
 def tune_command(
     *,
     file: str | None,
-    free: tuple[str, ...] = option(
-        "A gain that may be chosen, and from where to where. Repeat it.", "PATH=LO:HI"
-    ),
-    maximize: str = option("What is to be as large as can be: a gain, or as for --minimize.", "AIM"),
-    minimize: str = option(
-        "What is to be as small as can be: a gain; settling_time or spectral_radius (the same gains); "
-        '"coordination_error at 1 Hz", or impedance, transmitted_velocity; damping of slow motions; '
-        "coordination_error_h2, the rms at the ticks for white forces of 1 N rms, "
-        "coordination_error_hinf, the largest gain "
-        "at any frequency; or a weighted sum in SI of gains and these, "
-        '"damping - 0.01*coordination.stiffness".',
-        "AIM",
-    ),
-    constraint: tuple[str, ...] = option(
-        'Beside stability: "decay=60 dB in 2 s"; "impedance at 5 Hz < 20 N*s/m", or transmitted_velocity in '
-        "m/s/N, coordination_error in m/N, damping, coordination_error_h2, coordination_error_hinf, or "
-        "delay=changing: "
-        "stable, too, where the delay of --over changes from packet to packet. May be repeated.",
-        "DEMAND",
-    ),
+    free: tuple[str, ...] = option("Gain to tune, with its range (repeatable).", "PATH=LO:HI"),
+    maximize: str = option("Objective to maximize.", "OBJECTIVE"),
+    minimize: str = option("Objective to minimize.", "OBJECTIVE"),
+    constraint: tuple[str, ...] = option("Requirement in addition to stability (repeatable).", "CONSTRAINT"),
     tradeoff: str = option(
-        "Weigh the aim against what a hand feels, impedance at 5 Hz: the best for each of 20 bounds "
-        "(Pareto front).",
-        "QUANTITY",
+        "Compute a Pareto front of 20 points against a quantity, e.g. impedance at 5 Hz.", "QUANTITY"
     ),
     over: tuple[str, ...] = option(
-        "What the gains have to bear, all of it: user.count=2:10, device.mass=±20%, lan.loss=0:0.05, or "
-        '"lan.delay=8 ms:20 ms", at every constant delay. May be repeated.',
-        "PATH=LO:HI",
+        "Operating range: user.count=2:10, device.mass=±20%, lan.loss=0:0.05 (repeatable).", "PATH=LO:HI"
     ),
     hands: str,
-    time: str = option("End after this long, with the best found and what is not proved of it.", '"TIME"'),
+    time: str = option("Time limit of the search.", '"TIME"', show_default="no limit"),
     settings: tuple[str, ...],
-    write: Path | None = option("Write the topology with these gains in it, comments and all (.yaml)."),
+    write: Path | None = option("Write the topology with the tuned gains (.yaml)."),
     plot: Path | None = picture_option(
-        "Draw two gains over the stable regions of what limits them and what a strike comes to, now and "
-        "with the gains found; or with --tradeoff the front: .png, .svg or .pdf."
+        "Plot the stability region and impulse response, or the Pareto front (.png, .svg, .pdf)."
     ),
     as_json: bool,
 ) -> None:
-    """Find the gains that do best, and prove that they do.
+    """Tune gains for an objective, with a proof of stability.
 
-    The free gains are chosen so that an aim, as one of them, is as large (or
-    small) as can be while the topology is stable in all that stands in --over.
-    They are printed to four digits, and proved at these: in boxes, for every
-    number of peers, over the network as it is. That no gains in these ranges
-    do better by 2 % is proved where that is quick; the answer says so, and how
-    many points were looked at. What is left out is as the topology's studies: tune: says.
+    The gains are stable for all values of --over, and printed and proved with
+    four digits. Global optimality within 2 % is proved where that is fast.
+    Omitted options are taken from studies: tune: of the topology.
+
+    \b
+    OBJECTIVE   a gain, settling_time, spectral_radius, "impedance at 5 Hz",
+                "transmitted_velocity at 5 Hz", "coordination_error at 1 Hz",
+                damping, coordination_error_h2, coordination_error_hinf, or a
+                weighted sum, "damping - 0.01*coordination.stiffness"
+    CONSTRAINT  "decay=60 dB in 2 s", "impedance at 5 Hz < 20 N*s/m" or another
+                of these quantities, delay=changing (delays that vary in time)
 
     \b
         apc tune --free "coordination.stiffness=10 N/m:5000 N/m" \\
@@ -92,29 +76,29 @@ def tune_command(
                  --maximize coordination.stiffness \\
                  --over user.count=2:10 --over device.mass=±20%
     """
-    from apc.frame.devices import FREE
-    from apc.inputs import open_topology
+    from apc.inputs.open_model import open_topology
+    from apc.lifting.devices import FREE
     from apc.output.pictures import write_picture
     from apc.output.tuning_output import panels_of
-    from apc.tuning.pareto_front import pareto_front
+    from apc.support.extension_table import require_extension
     from apc.tuning.specification import gripped_as_studied, read_seconds, read_tradeoff, read_tuning_spec
     from apc.tuning.tuner import tune
 
     note_typical_hand(hands)
     if write is not None and write.suffix not in (".yaml", ".yml"):
-        message, got = "the name of a topology", write.suffix or write.name
+        message, got = "suffix of --write", write.suffix or "none"
         raise ApcError(
             Diagnostic(
                 "E996",
-                SourceLocation("--write"),
+                SourceLocation(str(write)),
                 message,
-                ".yaml at its end",
+                ".yaml",
                 got,
-                f"{write.stem}-tuned.yaml",
+                f"--write {write.stem}-tuned.yaml",
             )
         )
     if write is not None and tradeoff:
-        raise click.UsageError("--write is of one design, and --tradeoff finds several")
+        raise click.UsageError("--write can't be combined with --tradeoff")
     system = open_topology(
         file,
         settings,
@@ -135,11 +119,11 @@ def tune_command(
         over=over,
         criterion=criterion,
     )
-    if plot is not None and not tradeoff:  # what can't be drawn is refused before the search
+    if plot is not None and not tradeoff:  # an impossible picture is refused before the search
         panels_of(system, len(tuning_spec.free))
     if tradeoff:
         with status_line() as progress:
-            weighed = pareto_front(
+            weighed = require_extension("pareto_front").pareto_front(
                 system, tuning_spec, read_tradeoff(tradeoff), seconds=read_seconds(time), progress=progress
             )
         if plot is not None:
@@ -163,12 +147,12 @@ def tune_command(
 
 
 def _write(system: Model, tuning: Tuning, settings: Sequence[str], path: Path) -> None:
-    """Write the topology with the gains, and with what else was set."""
+    """Write the topology with the gains and the settings."""
     from apc.app.yaml_edit import write_topology
     from apc.compiler.pipeline import compile_again
     from apc.compiler.wording import with_unit
-    from apc.frame.overrides import parse_override
-    from apc.frame.parameter_names import HELD, find
+    from apc.parameter_values.overrides import parse_override
+    from apc.parameter_values.parameter_names import HELD, find
 
     as_written = compile_again(replace(system.origin, changes=()), path.parent)
     # The numbers of the hand of --hands held are of no topology.

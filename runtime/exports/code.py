@@ -1,9 +1,9 @@
-"""A model handed over as code: a peer in C99, or an FMU of a peer or of all.
+"""A model exported as code: a peer in C99, or an FMU of a peer or of all peers.
 
 Takes: a `Model`, a peer's name, a device, a method. Gives: `Code`, `peer_code`, `write_code`;
 `topology_unit`.
 Guarantees: three texts are written together or not at all: `left.c`, `left.h`, and the driver `left_test.c`.
-Does not: compile what is written as C.
+Does not: compile the C texts.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from apc.exports.external_force import with_external_force
 from apc.exports.fmu import FmuContent, unit_of
 from apc.exports.peer_step import ExportedPeer, peer_of, refused, subsystems_of
 from apc.exports.topology_text import c_topology, single_peer
-from apc.frame.evaluation_errors import finite_equations
+from apc.linearization.evaluation_errors import finite_equations
 from apc.realtime.peer import number_of
 from apc.result import Result
 from apc.simulation.settings import DEFAULT, Method, parse_method
@@ -39,16 +39,16 @@ class Code(Result):
 
 
 def peer_code(system: Model, *, peer: str = "", device: str = "", method: str = "") -> Code:
-    """Write one peer in C.
+    """Return one peer as C code.
 
     Parameters
     ----------
     system
         The model.
     peer
-        Its name, such as "left[1]"; optional if all peers are equal.
+        The name of the peer, such as "left[1]"; optional if all peers are equal.
     device
-        The masses that move outside its computer, separated by commas, or "none"; by default determined from
+        The masses outside the peer's computer, separated by commas, or "none"; by default determined from
         the equations.
     method
         The integration method of the peer's computer between ticks, as for `simulate`.
@@ -56,34 +56,37 @@ def peer_code(system: Model, *, peer: str = "", device: str = "", method: str = 
     Raises
     ------
     ApcError
-        E963 the peers differ, and no name; E970 no such peer; and as `peer_of`, `parse_method`.
+        E963 the peers differ, and no name is given; E970 no such peer; and as `peer_of`, `parse_method`.
     """
-    how, plan = _plan(system, method)
+    chosen_method, plan = _plan(system, method)
     if not peer and len(set(subsystems_of(plan))) > 1:
-        message = "--peer: the peers differ, and a text of C is of one"
-        hint = f'--peer "{plan.exchange.peer_name(0)}"'
-        raise ApcError(Diagnostic("E963", SourceLocation(system.origin.topology), message, hint=hint))
+        message = "the peers differ; C code is written for one peer"
+        fix = f'--peer "{plan.exchange.peer_name(0)}"'
+        raise ApcError(Diagnostic("E963", SourceLocation(system.origin.topology), message, fix=fix))
     result = peer_of(
-        plan, number_of(plan.exchange, peer, "--peer") if peer else 0, how, device=device or None
+        plan, number_of(plan.exchange, peer, "--peer") if peer else 0, chosen_method, device=device or None
     )
-    return Code(system.name, result, str(how))
+    return Code(system.name, result, str(chosen_method))
 
 
 def topology_unit(system: Model, *, peer: str = "", method: str = "") -> FmuContent:
-    """Write an FMU of a model, or of one peer of it; parameters and errors as for `peer_code`."""
-    how, plan = _plan(with_external_force(system), method)
+    """Return an FMU of a model, or of one peer of the model; parameters and errors as for `peer_code`."""
+    chosen_method, plan = _plan(with_external_force(system), method)
     topology = (
-        single_peer(plan, number_of(plan.exchange, peer, "--peer"), how) if peer else c_topology(plan, how)
+        single_peer(plan, number_of(plan.exchange, peer, "--peer"), chosen_method)
+        if peer
+        else c_topology(plan, chosen_method)
     )
     return unit_of(system, topology, peer=peer)
 
 
 def _plan(system: Model, method: str) -> tuple[Method, SimulationPlan]:
-    how = parse_method(method) if method else DEFAULT
+    """Return the integration method of a text, and the simulation plan of a model."""
+    chosen_method = parse_method(method) if method else DEFAULT
     if not system.clocks:
-        raise refused(system, f"{system.name} has no clock: nothing is computed at any tick")
+        raise refused(system, f"{system.name} has no clock, so nothing is computed at ticks")
     with finite_equations(system.name):
-        return how, plan_of(system, how)
+        return chosen_method, plan_of(system, chosen_method)
 
 
 _INCLUDED = re.compile(r"[^\x00-\x1f\"\\]+")
@@ -93,8 +96,8 @@ def write_code(path: Path, code: Code) -> None:
     """Write a peer's code with its header and a driver. Raises ApcError (E601) on failure."""
     include = f"{path.stem}.h"
     if not _INCLUDED.fullmatch(include):
-        message = f"{include} can't be the name of a header in C"
-        raise ApcError(Diagnostic("E601", SourceLocation(str(path)), message, hint="--out peer.c"))
+        message = f"{include} is not a valid name of a C header"
+        raise ApcError(Diagnostic("E601", SourceLocation(str(path)), message, fix="--out peer.c"))
     write_texts(
         {
             path.with_suffix(".h"): header(code.code),

@@ -16,11 +16,11 @@ import casadi
 
 from apc.compiler.compiled import Hold, Model, Parameter, PeerType, Timing
 from apc.compiler.functions.topology_data import NO_DELAY
-from apc.frame.devices import Device, coupled_directly, find_devices, rewritten
-from apc.frame.jacobians import jacobians
-from apc.frame.parameters import resolve
+from apc.lifting.devices import Device, coupled_directly, find_devices, rewritten
+from apc.linearization.jacobians import jacobians
+from apc.parameter_values.parameters import resolve
 
-FORCE_ON = "force on "  # and the device
+FORCE_ON = "force on "  # followed by the name of the device
 
 
 def with_external_force(system: Model) -> Model:
@@ -48,7 +48,7 @@ def with_external_force(system: Model) -> Model:
         )
         if devices:
             peer_types[group.peer_type] = _with_external_force(peer_type, devices, fastest)
-            added |= {name: Parameter(name, "N", 0.0, description="a force from outside") for name in devices}
+            added |= {name: Parameter(name, "N", 0.0, description="external force") for name in devices}
     timings = {timing.name: timing for timing in (Timing(NO_DELAY, Fraction(0)), *system.timings)}
     return replace(
         system,
@@ -59,26 +59,33 @@ def with_external_force(system: Model) -> Model:
 
 
 def _with_external_force(peer_type: PeerType, devices: dict[str, Device], fastest: int) -> PeerType:
-    """Return a peer type with a force on each of its devices, by name, which a clock partition puts out."""
-    before = peer_type.clocks[fastest]
-    held, local, first = len(peer_type.holds), len(peer_type.parameters), len(before.outputs)
-    holds = (Hold(name, before.clock, first + index, NO_DELAY) for index, name in enumerate(devices))
+    """Return a peer type with a force on each of its devices, by name, as outputs of a clock partition."""
+    original = peer_type.clocks[fastest]
+    hold_count, parameter_count, first = (
+        len(peer_type.holds),
+        len(peer_type.parameters),
+        len(original.outputs),
+    )
+    holds = (Hold(name, original.clock, first + index, NO_DELAY) for index, name in enumerate(devices))
 
     def rates(x: Any, u: Any, p: Any, t: Any) -> Any:
-        old = x, u[:held], p[:local], t
-        result = casadi.vertsplit(peer_type.derivative(*old))
-        for device, force in zip(devices.values(), casadi.vertsplit(u[held:]), strict=True):
-            result[device.velocity] += device.symbolic(*old) * force
+        """Return the rates with the external forces added."""
+        original_arguments = x, u[:hold_count], p[:parameter_count], t
+        result = casadi.vertsplit(peer_type.derivative(*original_arguments))
+        for device, force in zip(devices.values(), casadi.vertsplit(u[hold_count:]), strict=True):
+            result[device.velocity] += device.symbolic(*original_arguments) * force
         return casadi.vertcat(*result)
 
-    larger = replace(
+    extended = replace(
         peer_type, parameters=(*peer_type.parameters, *devices), holds=(*peer_type.holds, *holds)
     )
-    whole = rewritten(larger, peer_type, lambda x, p: x, rates)
-    clock, inputs = whole.clocks[fastest], whole.clocks[fastest].tick.sx_in()
-    value = casadi.vertcat(clock.tick(*inputs), inputs[-2][local:])
-    tick = casadi.Function(before.tick.name(), inputs, [value], before.tick.name_in(), before.tick.name_out())
+    forced = rewritten(extended, peer_type, lambda x, p: x, rates)
+    clock, inputs = forced.clocks[fastest], forced.clocks[fastest].tick.sx_in()
+    value = casadi.vertcat(clock.tick(*inputs), inputs[-2][parameter_count:])
+    tick = casadi.Function(
+        original.tick.name(), inputs, [value], original.tick.name_in(), original.tick.name_out()
+    )
     units = (*clock.units, *("N" for _ in devices))
     clock = replace(clock, tick=tick, outputs=(*clock.outputs, *devices), units=units)
-    clocks = (*whole.clocks[:fastest], clock, *whole.clocks[fastest + 1 :])
-    return replace(whole, clocks=clocks)
+    clocks = (*forced.clocks[:fastest], clock, *forced.clocks[fastest + 1 :])
+    return replace(forced, clocks=clocks)

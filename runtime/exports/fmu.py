@@ -22,24 +22,24 @@ from typing import ClassVar
 from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.files import write_file
-from apc.distribution import program_version
 from apc.exports.c_text import header, source
 from apc.exports.texts import filled
 from apc.exports.topology_text import CTopology, shared
 from apc.result import Result
 from apc.simulation.c_compiler import compiler
+from apc.support.distribution import program_version
 
 # Options of gcc and clang; contracted products and sums would round differently from `simulate`.
 OPTIONS = ("-std=c99", "-O2", "-ffp-contract=off", "-fPIC", "-fvisibility=hidden", "-shared")
 PATIENCE = 600.0  # seconds; a model's code takes a few
 PLATFORMS = {"Linux": ("linux", ".so"), "Darwin": ("darwin", ".dylib"), "Windows": ("win", ".dll")}
 OFFSET_OF_GUID = "GUID_OF_TEXTS"
-DATE = (1980, 1, 1, 0, 0, 0)  # of every member of the archive: the first there is
+DATE = (1980, 1, 1, 0, 0, 0)  # of every member of the archive: the earliest date of ZIP
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FmuContent(Result):
-    """An FMU: the model it simulates, or `peer` if it is one peer, and its texts by their names.
+    """The content of an FMU: its model, or `peer` if it contains one peer, and its texts by file name.
 
     `step` and `duration` are the proposed step size and duration in seconds; `guid` is a digest of the texts.
     """
@@ -67,7 +67,7 @@ class FmuContent(Result):
 
 
 def unit_of(system: Model, topology: CTopology, *, peer: str = "") -> FmuContent:
-    """Return the FMU of a model, or of the peer of that name."""
+    """Return the content of the FMU of a model, or of the peer of that name."""
     timings = {timing.name: timing.value for timing in system.timings}
     step = float(min(timings[clock.period] for clock in system.clocks))
     duration = system.experiment.duration
@@ -88,7 +88,7 @@ def unit_of(system: Model, topology: CTopology, *, peer: str = "") -> FmuContent
 
 
 def compile_texts(texts: Mapping[str, str], options: Sequence[str], location: SourceLocation) -> bytes:
-    """Return the compiled library of C texts, given by file name; `location` is the location for messages.
+    """Return the compiled library of C texts, given by file name; `location` is that of error messages.
 
     Raises
     ------
@@ -97,16 +97,14 @@ def compile_texts(texts: Mapping[str, str], options: Sequence[str], location: So
     """
     pair = compiler()
     if pair is None:
-        message = "no C compiler answers to cc, gcc or clang, or to what the variable CC says"
-        raise ApcError(
-            Diagnostic("E962", location, message, hint="gcc or clang installed, or --to c, which needs none")
-        )
+        message = "no C compiler found (cc, gcc, clang or the variable CC)"
+        raise ApcError(Diagnostic("E962", location, message, advice="install gcc or clang, or use --to c"))
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         for item, text in texts.items():
             (folder / item).write_text(text, encoding="utf-8")
-        listed = [text for text in texts if text.endswith(".c")]
-        command = [pair[0], *options, *listed, "-o", "built", "-lm"]
+        sources = [text for text in texts if text.endswith(".c")]
+        command = [pair[0], *options, *sources, "-o", "built", "-lm"]
         try:
             done = subprocess.run(
                 command, cwd=folder, capture_output=True, text=True, timeout=PATIENCE, check=False
@@ -115,13 +113,13 @@ def compile_texts(texts: Mapping[str, str], options: Sequence[str], location: So
             raise ApcError(Diagnostic("E962", location, f"{pair[0]} can't be run: {error}")) from None
         if done.returncode:
             messages = (done.stderr.strip().splitlines() or ["nothing"])[0][:200]
-            message = f"{pair[0]} doesn't compile it, and says: {messages}"
+            message = f"{pair[0]} failed to compile the code: {messages}"
             raise ApcError(Diagnostic("E962", location, message))
         return (folder / "built").read_bytes()
 
 
 def write_fmu(path: Path, unit: FmuContent) -> None:
-    """Write an FMU, whole or not at all. Raises ApcError (E601, E962)."""
+    """Write an FMU completely or not at all. Raises ApcError (E601, E962)."""
     system, suffix = PLATFORMS.get(platform.system(), PLATFORMS["Linux"])
     library = compile_texts(unit.texts, OPTIONS, SourceLocation(str(path)))
     members = {"modelDescription.xml": unit.description.encode()}
@@ -129,6 +127,7 @@ def write_fmu(path: Path, unit: FmuContent) -> None:
     members[f"binaries/{system}64/{unit.identifier}{suffix}"] = library
 
     def write(temporary: Path) -> None:
+        """Write the archive to a temporary file."""
         with zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
             for text, content in members.items():
                 archive.writestr(zipfile.ZipInfo(text, DATE), content, zipfile.ZIP_DEFLATED)

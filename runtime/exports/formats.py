@@ -2,12 +2,13 @@
 
 Takes: a `Model`, the destination and the options.
 Gives: `Format`, `FORMATS`; `ExportRequest`; `format_of`, `export`.
-Guarantees: a format is chosen by its name or by the suffix, which agree; an option that means nothing to a
-format is refused; a maker is imported when it is asked for.
-Does not: make anything itself.
+Guarantees: a format is chosen by its name or by the suffix, which agree; an option that does not apply to a
+format is refused; the export function of a format is imported when it is used.
+Does not: export anything itself.
 
-A new format is a line of the table, its name, its suffix, what it is, the options it takes, and a case of
-`_makers`: a function that makes a result of a model and the options, and one that writes it.
+A new format is a line of the table (name, suffix, description, applicable options) and a case of
+`_export_functions`: a function that returns a result for a model and the options, and a function that writes
+the result.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation, nearest
 from apc.network.nominal_criterion import refuse_range
 from apc.result import Result
-from apc.suffixes import check_suffix
+from apc.support.suffixes import check_suffix
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +52,7 @@ class Format:
 
 
 FORMATS = (
-    Format("control", ".py", "a script that makes a control.StateSpace", ("open_at",)),
+    Format("control", ".py", "a script that creates a control.StateSpace", ("open_at",)),
     Format("mat", ".mat", "a state space for MATLAB and SciPy", ("open_at", "symbolic")),
     Format("npz", ".npz", "a state space for NumPy", ("open_at", "symbolic")),
     Format("modelica", ".mo", "a flat model of Modelica 3.3 with clocks", ()),
@@ -60,8 +61,8 @@ FORMATS = (
 )
 
 
-def _makers(name: str) -> tuple[Callable[..., Result], Callable[[Path, Any], None]]:
-    """Return the export function of a format for a model and its options, and the function that writes it."""
+def _export_functions(name: str) -> tuple[Callable[..., Result], Callable[[Path, Any], None]]:
+    """Return the function that creates the export of a model and options, and the function that writes it."""
     match name:
         case "modelica":
             from apc.exports.modelica import modelica, write_modelica
@@ -92,7 +93,7 @@ def format_of(to: str | None, out: Path | None, *, option: str = "--") -> Format
     out
         The file, None if nothing is written.
     option
-        The notation of options: "--" before or "=" behind.
+        The notation of options: "--" before, or "=" after, the name.
 
     Raises
     ------
@@ -104,9 +105,7 @@ def format_of(to: str | None, out: Path | None, *, option: str = "--") -> Format
     if to is None:
         if out is None:
             raise ApcError(
-                Diagnostic(
-                    "E952", SourceLocation("export"), "no format is named", f"one of {', '.join(names)}"
-                )
+                Diagnostic("E952", SourceLocation("export"), "no format given", f"one of {', '.join(names)}")
             )
         suffix = check_suffix(out, [item.suffix for item in FORMATS], written)
         return next(item for item in FORMATS if item.suffix == suffix)
@@ -116,7 +115,7 @@ def format_of(to: str | None, out: Path | None, *, option: str = "--") -> Format
         location = SourceLocation("--to" if option == "--" else "to")
         raise ApcError(
             Diagnostic(
-                "E952", location, "a format", f"one of {', '.join(names)}", to[:40], f"{location} {near}"
+                "E952", location, "format", f"one of {', '.join(names)}", to[:40], f"{location} {near}"
             )
         )
     if out is not None:
@@ -125,7 +124,7 @@ def format_of(to: str | None, out: Path | None, *, option: str = "--") -> Format
 
 
 def export(system: Model, chosen: Format, request: ExportRequest, out: Path | None = None) -> Result:
-    """Create the export of a model in a format, and write it.
+    """Return the export of a model in a format, written to a file if `out` is given.
 
     Parameters
     ----------
@@ -139,20 +138,20 @@ def export(system: Model, chosen: Format, request: ExportRequest, out: Path | No
     Raises
     ------
     ApcError
-        E953 an option that the format does not have; E899 a delay that is a range; E601 the file can't be
-        written; and those of the export function.
+        E953 an option that does not apply to the format; E899 a delay that is a range; E601 the file cannot
+        be written; and those of the export function.
     """
     for name in ExportRequest.__slots__:
         if getattr(request, name) and name not in chosen.takes:
             able = ", ".join(item.name for item in FORMATS if name in item.takes)
             option = f"--{name.replace('_', '-')}"
-            message = f"{option} means nothing to the format {chosen.name}"
+            message = f"{option} has no effect for the format {chosen.name}"
             raise ApcError(
-                Diagnostic("E953", SourceLocation(option), message, hint=f"--to {able}" if able else "")
+                Diagnostic("E953", SourceLocation(option), message, fix=f"--to {able}" if able else "")
             )
     refuse_range(system)
-    make, write = _makers(chosen.name)
-    parameter = make(system, **{name: getattr(request, name) for name in chosen.takes})
+    make, write = _export_functions(chosen.name)
+    result = make(system, **{name: getattr(request, name) for name in chosen.takes})
     if out is not None:
-        write(out, parameter)
-    return parameter
+        write(out, result)
+    return result

@@ -1,8 +1,8 @@
 """Identifiers for other tools from the names of a model.
 
 Takes: names such as `left[2].cube.x`. Gives: `ExportedSignal`, `words`; `identifier`; `prefixed`; `unique`.
-Guarantees: an identifier is made of letters, digits and `_`, begins with a letter, and is no reserved word of
-C; of several no two are equal. A prefixed identifier is no word or macro of C or C++ either.
+Guarantees: an identifier consists of letters, digits and `_`, begins with a letter, and is no reserved word
+of C; several identifiers are distinct. A prefixed identifier is no word or macro of C or C++ either.
 Does not: select the tool.
 """
 
@@ -30,18 +30,18 @@ class ExportedSignal:
 
 
 def words(ports: Sequence[ExportedSignal]) -> list[str]:
-    """Return an identifier for each of some names, of which no two are equal."""
+    """Return distinct identifiers for the names of some signals."""
     return [*unique(identifier(port.name) for port in ports)]
 
 
 def identifier(name: str) -> str:
-    """Return a name as programs have it: letters, digits and _, no word of C."""
+    """Return an identifier for a name: letters, digits and _, no reserved word of C."""
     text = re.sub(r"[^A-Za-z0-9]+", "_", name).strip("_") or "n"
     return f"n{text}" if text[0].isdigit() else f"{text}_" if text in RESERVED else text
 
 
 def prefixed(prefix: str, names: Iterable[str]) -> tuple[str, ...]:
-    """Return an identifier for each of some names, such as `link_lan`, of which no two are equal.
+    """Return distinct identifiers with a prefix for some names, such as `link_lan`.
 
     No keyword, macro or identifier that a template writes itself begins with such a prefix and `_`.
     """
@@ -51,7 +51,7 @@ def prefixed(prefix: str, names: Iterable[str]) -> tuple[str, ...]:
 
 
 def unique(names: Iterable[str], occupied: Iterable[str] = ()) -> tuple[str, ...]:
-    """Return names of which none is equal to another or taken: a repeated one gets a number behind."""
+    """Return distinct names that are not occupied: a number is appended to a repeated name."""
     used, texts, counts = set(occupied), list[str](), dict[str, int]()
     for base in names:
         name, count = base, counts.get(base, 1)

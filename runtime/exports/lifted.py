@@ -34,28 +34,28 @@ from numpy.typing import NDArray
 from apc.analysis.analysis import lifted_groups, near_start
 from apc.compiler.compiled import Model, PeerType
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation, nearest
-from apc.distribution import versions
-from apc.eigen.interconnection import ModalSystem, interconnect_with_inputs, lay_out_loop
-from apc.eigen.modes import dense_loop
-from apc.eigen.peer_classes import PeerClass, states_of
 from apc.exports.identifiers import ExportedSignal
-from apc.frame.communication_graph import CommunicationGraph
-from apc.frame.devices import Device, ForceInput, find_push
-from apc.frame.discretize import TOO_LARGE, discretize
-from apc.frame.evaluation_errors import finite_equations
-from apc.frame.frame_inputs import OUTSIDE, with_cuts, with_holds, with_ports
-from apc.frame.interval_arithmetic import FLOATS, MIDPOINT_RADIUS, Arithmetic, value_of
-from apc.frame.lift import MOST_PACKETS, FrameMap, check_packets, compose, step_durations
-from apc.frame.linear_subsystem import LinearSubsystem
-from apc.frame.numeric_model import Prepared, prepare
-from apc.frame.schedule import ClockedValue, ReceivedSample, Schedule, Tick
-from apc.memory import refuse_beyond
+from apc.lifting.devices import Device, ForceInput, find_push
+from apc.lifting.discretize import TOO_LARGE, discretize
+from apc.lifting.frame_inputs import OUTSIDE, with_cuts, with_holds, with_ports
+from apc.lifting.interval_arithmetic import FLOATS, MIDPOINT_RADIUS, Arithmetic, value_of
+from apc.lifting.lift import MOST_PACKETS, FrameMap, check_packets, compose, step_durations
+from apc.lifting.numeric_model import NumericModel, numeric_model
+from apc.linearization.evaluation_errors import finite_equations
+from apc.linearization.linear_subsystem import LinearSubsystem
 from apc.network.nominal_criterion import limitations
 from apc.result import Result
 from apc.simulation.program import timed_events
 from apc.simulation.signals import local_signals, ticking_partitions
 from apc.simulation.trajectory import parameters_of, texts_of
-from apc.threads import single_threaded
+from apc.spectrum.interconnection import ModalSystem, interconnect_with_inputs, lay_out_loop
+from apc.spectrum.modes import dense_loop
+from apc.spectrum.peer_classes import PeerClass, states_of
+from apc.support.distribution import versions
+from apc.support.memory import refuse_beyond
+from apc.support.threads import single_threaded
+from apc.timing.communication_graph import CommunicationGraph
+from apc.timing.schedule import ClockedValue, ReceivedSample, Schedule, Tick
 
 if TYPE_CHECKING:
     import control
@@ -70,13 +70,12 @@ ENTRY = 40
 
 
 Labels = tuple[ExportedSignal, ...]
-Placed = list[tuple[ExportedSignal, int]]  # and where each is in z
+Placed = list[tuple[ExportedSignal, int]]  # signals, each with its index in z
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StateSpace(Result):
-    """A discrete state space with the sample time `frame_s`; `open_at` is the link or coupler where it is
-    cut, "" if closed.
+    """A discrete state space with the sampling period `frame_s` in seconds.
 
     `open_at` is the link or coupler where the loop is cut, "" for the closed loop. `notes` list the
     limitations. With `symbolic` parameters, `function` is a `casadi.Function` of them, one argument each in
@@ -102,17 +101,17 @@ class StateSpace(Result):
 
     @property
     def matrices(self) -> tuple[Floats, Floats, Floats, Floats]:
-        """A, B, C and D."""
+        """The matrices A, B, C and D."""
         return self.a, self.b, self.c, self.d
 
     @property
     def content(self) -> str:
-        """The closed loop, or where it is cut."""
+        """A text for the loop: closed, or cut at a link or coupler."""
         return f"the loop cut at {self.open_at}" if self.open_at else "the closed loop"
 
     @property
     def meaning(self) -> str:
-        """The hold of inputs, and the instants of outputs."""
+        """A text on the hold of inputs and the instants of outputs."""
         step = f"x[k+1] = A x[k] + B u[k], y[k] = C x[k] + D u[k], one step a frame of {self.frame_s!r} s"
         if self.open_at:
             closing = "as by control.feedback(system, the identity), it is the closed loop"
@@ -121,7 +120,10 @@ class StateSpace(Result):
         return f"{step}. {held}; y are the values just before it."
 
     def to_control(self) -> control.StateSpace:
-        """Return it as python-control's, names in letters, digits and `_`. Raises ApcError (E875)."""
+        """Return the state space as `control.StateSpace`, with names as identifiers.
+
+        Raises ApcError (E875).
+        """
         return self._shown("control")
 
 
@@ -129,7 +131,7 @@ class StateSpace(Result):
 class FrameNumbers:
     """The numerical parts of a frame in one number type.
 
-    `subsystem` returns the matrices of some peers, `inverses` the 1/m of the bodies with force inputs,
+    `subsystem` returns the matrices of some peers, `inverses` the effects 1/m of a force input on velocities,
     `steps` [F G] for durations in seconds, with the given number of inputs after the holds, forces first.
     """
 
@@ -142,7 +144,7 @@ class FrameNumbers:
 def steps_in_floats(
     group: PeerClass, forces: Sequence[ForceInput], count: int, durations: Sequence[Fraction]
 ) -> list[Matrix]:
-    """Return [F G] of some durations in floats, of exact matrices: see `FrameNumbers`."""
+    """Return [F G] of some durations in floats, from exact matrices (see `FrameNumbers`)."""
     columns = np.zeros((len(group.exact.a), count), dtype=object)
     for index, push in enumerate(forces):
         columns[list(push.velocities), index] = push.inverses
@@ -156,21 +158,21 @@ IN_FLOATS = FrameNumbers(
 
 
 def state_space(system: Model, *, open_at: str = "") -> StateSpace:
-    """Lift a model, all its peers in one system.
+    """Return the state space of a model, with all peers in one system.
 
     Parameters
     ----------
     system
         The model.
     open_at
-        The link or coupler to cut it at; "" leaves it closed.
+        The link or coupler at which the loop is cut; "" for the closed loop.
 
     Raises
     ------
     ApcError
-        E950 nothing to cut at; E951 too many states; and those of `analysis.lifted_groups`.
+        E950 no such link or coupler; E951 too many states; and those of `analysis.lifted_groups`.
     """
-    groups, exchange = peers_of(system)
+    groups, exchange = peers_of(numeric_model(system))
     (a, b, c, d), (states, inputs, outputs), unpushed = lifted(system, groups, exchange, open_at, IN_FLOATS)
     if not all(np.isfinite(block).all() for block in (a, b, c, d)):
         raise ApcError(Diagnostic("E806", SourceLocation(system.name), TOO_LARGE))
@@ -181,25 +183,28 @@ def state_space(system: Model, *, open_at: str = "") -> StateSpace:
     )
 
 
-def peers_of(
-    system: Model, *, prepared: Prepared | None = None
-) -> tuple[tuple[PeerClass, ...], CommunicationGraph]:
-    """Return the peers of a system as `analysis.lifted_groups`, with oversized systems refused as E951."""
+def peers_of(numeric: NumericModel) -> tuple[tuple[PeerClass, ...], CommunicationGraph]:
+    """Return the peers of a system as `analysis.lifted_groups`; too large a system raises ApcError E951."""
     try:
-        return lifted_groups(system, prepared=prepared)
+        return lifted_groups(numeric)
     except ApcError as error:
         if any(mistake.code != "E804" for mistake in error.mistakes):
             raise
         message = error.mistakes[0].message
         raise ApcError(
-            Diagnostic("E951", SourceLocation(system.origin.topology), message, hint="fewer peers")
+            Diagnostic(
+                "E951",
+                SourceLocation(numeric.model.origin.topology),
+                message,
+                advice="reduce the number of peers",
+            )
         ) from None
 
 
 def description(system: Model) -> tuple[float, tuple[str, ...]]:
-    """Return the length of a frame of a model, in seconds, and the limitations of its linear map."""
-    prepared = prepare(system)
-    return float(prepared.schedules[0].frame_s), (*near_start(system, prepared), *limitations(system))
+    """Return the length of a model's frame in seconds, and the limitations of its linear map."""
+    numeric = numeric_model(system)
+    return float(numeric.schedules[0].frame_s), (*near_start(numeric), *limitations(system))
 
 
 def made_by(system: Model) -> str:
@@ -221,26 +226,26 @@ def lifted(
     open_at: str,
     numbers: FrameNumbers,
 ) -> tuple[Blocks, tuple[Labels, Labels, Labels], tuple[str, ...]]:
-    """Return A, B, C and D of a model in a kind of number, the names of states, inputs, outputs, and notes.
+    """Return A, B, C and D of a model in a number type, the names of states, inputs and outputs, and notes.
 
     Parameters
     ----------
     system, open_at
         As for `state_space`.
     groups, exchange
-        Its peers, from `analysis.lifted_groups`.
+        The peers and the communication graph, from `analysis.lifted_groups`.
     numbers
         The numerical parts of the frame.
     """
     with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
         link = _link_of(system, open_at)
-        opened = [_open_loop(system, group, "" if link else open_at, numbers) for group in groups]
-        _check_size(system, opened)
-        loop = dense_loop([item.group for item in opened], exchange)
-        of_schedule = {id(item.group.schedule): item for item in opened}
-        subsystems = [of_schedule[id(subsystem.schedule)] for subsystem in loop.subsystems]
+        driven_peers = [_open_loop(system, group, "" if link else open_at, numbers) for group in groups]
+        _check_size(system, driven_peers)
+        loop = dense_loop([item.group for item in driven_peers], exchange)
+        peers_by_schedule = {id(item.group.schedule): item for item in driven_peers}
+        subsystems = [peers_by_schedule[id(subsystem.schedule)] for subsystem in loop.subsystems]
         blocks, labels = _closed(loop, subsystems, link=link, open_at=open_at, arithmetic=numbers.arithmetic)
-    notes = () if open_at else tuple(dict.fromkeys(note for item in opened for note in item.unpushed))
+    notes = () if open_at else tuple(dict.fromkeys(note for item in driven_peers for note in item.unpushed))
     return blocks, labels, notes
 
 
@@ -248,9 +253,9 @@ def lifted(
 class _DrivenPeers:
     """Peers with external inputs: `group` includes the inputs, `map` is their frame map.
 
-    `signals` are the simulated signals with their indices in z, `inputs` the inputs with theirs. `cuts` are
-    the forces cut open and the entries of z with their computed values; the last received values replace
-    them. `unpushed` lists the bodies without force input, with the reason.
+    `signals` are the simulated signals with their indices in z, `inputs` the inputs with their indices.
+    `cuts` are the forces cut open, with the indices of their computed values in z; the last received values
+    replace these. `unpushed` lists the bodies without force input, with the reason.
     """
 
     group: PeerClass
@@ -262,19 +267,23 @@ class _DrivenPeers:
 
 
 def _open_loop(system: Model, group: PeerClass, open_at: str, numbers: FrameNumbers) -> _DrivenPeers:
-    """Let forces and noise into some peers, and cut the forces of a coupler open."""
-    schedule, peer_type = _remembering(group), group.jacobians.peer_type
-    (forces, unpushed), noises = _masses(system, group), _measured(group.subsystem)
+    """Return some peers with forces and noise as inputs, and with the forces of a coupler cut open."""
+    schedule, peer_type = _with_computed_values(group), group.jacobians.peer_type
+    (forces, unpushed), noises = _force_inputs(system, group), _sampled_states(group.subsystem)
     inverses = [numbers.inverses(group, force) for force in forces]
-    wide = _with_inputs(numbers.subsystem(group), forces, inverses, noises)
+    extended = _with_inputs(numbers.subsystem(group), forces, inverses, noises)
     count = len(forces) + len(noises)
-    nothing = np.zeros((0, sum(wide.b.shape)), dtype=wide.b.dtype)
-    (subsystem,), full, ports = with_ports([wide], schedule, count, [0], [nothing], [])
-    subsystem, full, cuts = _cut_open(subsystem, full, open_at)
-    check_packets(full)
-    durations = step_durations(full)
-    steps = numbers.steps(group, forces, count, [duration * full.quantum for duration in durations])
-    frame = compose(subsystem, full, dict(zip(durations, steps, strict=True)), numbers=numbers.arithmetic)
+    no_readings = np.zeros((0, sum(extended.b.shape)), dtype=extended.b.dtype)
+    (subsystem,), extended_schedule, ports = with_ports([extended], schedule, count, [0], [no_readings], [])
+    subsystem, extended_schedule, cuts = _cut_open(subsystem, extended_schedule, open_at)
+    check_packets(extended_schedule)
+    durations = step_durations(extended_schedule)
+    steps = numbers.steps(
+        group, forces, count, [duration * extended_schedule.quantum for duration in durations]
+    )
+    frame = compose(
+        subsystem, extended_schedule, dict(zip(durations, steps, strict=True)), numbers=numbers.arithmetic
+    )
     first = {value: len(peer_type.states) + k for k, value in enumerate(schedule.discrete_states)}
     signals = [
         (
@@ -292,7 +301,9 @@ def _open_loop(system: Model, group: PeerClass, open_at: str, numbers: FrameNumb
         for index in noises
     ]
     return _DrivenPeers(
-        group=group.with_subsystem(subsystem, group.exact, full, frame.mapped(MIDPOINT_RADIUS.exact)),
+        group=group.with_subsystem(
+            subsystem, group.exact, extended_schedule, frame.mapped(MIDPOINT_RADIUS.exact)
+        ),
         map=frame,
         signals=signals,
         inputs=list(zip(inputs, ports.input_slots.ravel().tolist(), strict=True)),
@@ -301,10 +312,10 @@ def _open_loop(system: Model, group: PeerClass, open_at: str, numbers: FrameNumb
     )
 
 
-def _remembering(group: PeerClass) -> Schedule:
-    """Return a peer's frame map with the last computed values of its clocks among the states."""
+def _with_computed_values(group: PeerClass) -> Schedule:
+    """Return a peer's schedule with the last computed values of its clocks among the discrete states."""
     schedule, peer_type = group.schedule, group.jacobians.peer_type
-    at = _instants(schedule)
+    tick_times = _instants(schedule)
     values = [
         ClockedValue(p, o, -1)
         for p in ticking_partitions(schedule)
@@ -313,7 +324,7 @@ def _remembering(group: PeerClass) -> Schedule:
     values = [value for value in values if value not in schedule.discrete_states]
     names = [
         f"{peer_type.clocks[value.partition].outputs[value.output]}"
-        f"({float((at[value.partition][-1] - schedule.frame) * schedule.quantum * 1000):.6g} ms)"
+        f"({float((tick_times[value.partition][-1] - schedule.frame) * schedule.quantum * 1000):.6g} ms)"
         for value in values
     ]
     return replace(
@@ -333,12 +344,12 @@ def _instants(schedule: Schedule) -> dict[int, list[int]]:
     return result
 
 
-def _masses(system: Model, group: PeerClass) -> tuple[list[ForceInput], list[str]]:
-    """Return a peer's bodies with a mass as force inputs, axis by axis; and the reasons for others."""
+def _force_inputs(system: Model, group: PeerClass) -> tuple[list[ForceInput], list[str]]:
+    """Return the force inputs of a peer's bodies, axis by axis, and the reasons for bodies without one."""
     unit_of = {parameter.name: parameter.unit for parameter in system.parameters}
-    known: dict[str, Device | str | None] = {}
+    device_cache: dict[str, Device | str | None] = {}
     result = [
-        find_push(group.jacobians, group.parameters, unit_of, group.initial_reception, index, known)
+        find_push(group.jacobians, group.parameters, unit_of, group.initial_reception, index, device_cache)
         for index, state in enumerate(group.jacobians.peer_type.states)
         if state.unit == "m"
     ]
@@ -346,17 +357,17 @@ def _masses(system: Model, group: PeerClass) -> tuple[list[ForceInput], list[str
     for push in result:
         if isinstance(push, ForceInput):
             pushes.setdefault(push.part, push)
-    refused = dict.fromkeys(f"no force of its own: {text}" for text in result if isinstance(text, str))
+    refused = dict.fromkeys(f"no separate force input: {text}" for text in result if isinstance(text, str))
     return list(pushes.values()), list(refused)
 
 
-def _measured(subsystem: LinearSubsystem) -> list[int]:
-    """Return the states that something samples."""
-    looking = [
+def _sampled_states(subsystem: LinearSubsystem) -> list[int]:
+    """Return the states that a tick or a send samples."""
+    patterns = [
         values.any(axis=0)
         for values in (*(tick.x for tick in subsystem.ticks), *(send.x for send in subsystem.sends))
     ]
-    indices: list[int] = np.flatnonzero(np.any(looking, axis=0)).tolist() if looking else []
+    indices: list[int] = np.flatnonzero(np.any(patterns, axis=0)).tolist() if patterns else []
     return indices
 
 
@@ -368,20 +379,20 @@ def _with_inputs(
 ) -> LinearSubsystem:
     """Return a subsystem with a hold for each force and for each noise, which is added to sampled values.
 
-    `inverses` are what each force does to each of its velocities, `noises` the states with noisy samples.
+    `inverses` are the effects of each force on its velocities, `noises` the states with noisy samples.
     """
     columns = np.zeros((len(subsystem.a), len(forces) + len(noises)), dtype=subsystem.b.dtype)
     for index, (push, inverse) in enumerate(zip(forces, inverses, strict=True)):
         columns[list(push.velocities), index] = inverse
-    wide = with_holds(subsystem, columns)
-    sampled = [*((tick.u, tick.x) for tick in wide.ticks), *((send.u, send.x) for send in wide.sends)]
+    extended = with_holds(subsystem, columns)
+    sampled = [*((tick.u, tick.x) for tick in extended.ticks), *((send.u, send.x) for send in extended.sends)]
     for u, x in sampled if noises else ():
         u[:, -len(noises) :] = x[:, noises]
-    return wide
+    return extended
 
 
 def _link_of(system: Model, open_at: str) -> str:
-    """Return the link that a cut names, "" for a coupler. Raises ApcError (E950) if it names neither."""
+    """Return the link at which the loop is cut, "" for a coupler. Raises ApcError E950 for another name."""
     links = [link.name for link in system.links]
     parts = {hold.name.rpartition(".")[0] for peer_type in system.peer_types for hold in peer_type.holds}
     if open_at in links:
@@ -389,10 +400,10 @@ def _link_of(system: Model, open_at: str) -> str:
     if open_at and open_at not in parts:
         known = [*links, *sorted(parts)]
         listed = ", ".join(known) or "it has none"
-        message = f"{open_at[:80]} is no link or coupler with ticks of {system.name} ({listed})"
+        message = f"{open_at[:80]} is not a link or sampled coupler of {system.name} ({listed})"
         near = nearest(open_at, known) or (known[0] if known else "")
         raise ApcError(
-            Diagnostic("E950", SourceLocation("--open-at"), message, hint=f"--open-at {near}" if near else "")
+            Diagnostic("E950", SourceLocation("--open-at"), message, fix=f"--open-at {near}" if near else "")
         )
     return ""
 
@@ -400,39 +411,44 @@ def _link_of(system: Model, open_at: str) -> str:
 def _cut_open(
     subsystem: LinearSubsystem, schedule: Schedule, open_at: str
 ) -> tuple[LinearSubsystem, Schedule, Placed]:
-    """Make the forces of a coupler external inputs at each tick; the computed forces are entries of z."""
+    """Return a subsystem whose coupler forces are external inputs at each tick, its schedule, and the
+    computed forces.
+    """
     peer_type = subsystem.peer_type
     numbers = {partition.clock: p for p, partition in enumerate(peer_type.clocks)}
     forces = [hold for hold in peer_type.holds if open_at and hold.name.rpartition(".")[0] == open_at]
     cuts = list(dict.fromkeys((numbers[hold.clock], hold.output) for hold in forces))
     cuts = [(partition, output) for partition, output in cuts if schedule.ticks[partition]]
-    at, ports = _instants(schedule), []
+    tick_times, ports = _instants(schedule), []
     for partition, output in cuts:
         clock = peer_type.clocks[partition]
-        times = [float(number * schedule.quantum * 1000) for number in at[partition]]
+        times = [float(number * schedule.quantum * 1000) for number in tick_times[partition]]
         ports += [
             ExportedSignal(f"{clock.outputs[output]} at {when:.6g} ms", clock.units[output]) for when in times
         ]
     if len(schedule.received) + len(ports) > MOST_PACKETS:
-        message = (
-            f"{len(ports):,} ticks a frame, each an input where it is cut, and {MOST_PACKETS} are the most"
+        message = f"{len(ports):,} inputs at the opened loop, one for each tick; the limit is {MOST_PACKETS}"
+        raise ApcError(
+            Diagnostic("E951", SourceLocation("--open-at"), message, advice="open the loop at a link")
         )
-        raise ApcError(Diagnostic("E951", SourceLocation("--open-at"), message, hint="--open-at LINK"))
-    wide, whole = with_cuts(subsystem, schedule, cuts)
+    cut_subsystem, cut_schedule = with_cuts(subsystem, schedule, cuts)
     names = (*schedule.value_names, *(f"{port.name} computed" for port in ports))
     first = len(peer_type.states) + len(schedule.discrete_states)
     computed = [(port, first + index) for index, port in enumerate(ports)]
-    return wide, replace(whole, value_names=names), computed
+    return cut_subsystem, replace(cut_schedule, value_names=names), computed
 
 
 def _check_size(system: Model, opened: Sequence[_DrivenPeers]) -> None:
-    """Refuse a model whose matrix does not fit the memory: ApcError E951."""
+    """Raise ApcError E951 for a model whose matrix exceeds the memory."""
     columns = sum(item.group.count * states_of(item.group.schedule, item.group.jacobians) for item in opened)
     peers = sum(item.group.count for item in opened)
-    message = f"{columns:,} × {columns:,} numbers, the states and inputs of all {peers:,} peers together,"
+    message = f"{columns:,} × {columns:,} numbers (states and inputs of {peers:,} peers)"
     first = max(opened, key=lambda opened: opened.group.count).group
-    hint = f"fewer peers: --set {system.groups[0].name if len(opened) == 1 else first.name}.count=10"
-    refuse_beyond(ENTRY * columns**2, "E951", SourceLocation(system.origin.topology), message, hint)
+    advice = (
+        "reduce the number of peers, such as by --set "
+        f"{system.groups[0].name if len(opened) == 1 else first.name}.count=10"
+    )
+    refuse_beyond(ENTRY * columns**2, "E951", SourceLocation(system.origin.topology), message, advice)
 
 
 def _closed(
@@ -443,11 +459,22 @@ def _closed(
     open_at: str,
     arithmetic: Arithmetic,
 ) -> tuple[Blocks, tuple[Labels, Labels, Labels]]:
-    """Close a loop, but where it is cut; return A, B, C and D, and the names of states, inputs, outputs."""
+    """Return A, B, C and D of a loop that is closed except at the cut, and the names of states, inputs and
+    outputs.
+
+    Parameters
+    ----------
+    loop, subsystems
+        The loop of all peers, and the driven peers of each subsystem.
+    link, open_at
+        The link at which the loop is cut, "" for none; and the link or coupler.
+    arithmetic
+        The number type.
+    """
     layout = lay_out_loop(loop)
     n, peers = len(layout.names), [subsystem.name for subsystem in loop.subsystems]
     received = [subsystem.group.schedule.received for subsystem in subsystems]
-    opened = [
+    external_rows = [
         [
             row
             for row, subject in enumerate(rows)
@@ -455,20 +482,23 @@ def _closed(
         ]
         for rows in received
     ]
-    maps = [_from_outside(subsystem.map, rows) for subsystem, rows in zip(subsystems, opened, strict=True)]
-    whole = interconnect_with_inputs(loop, maps, [*map(len, opened)], layout, numbers=arithmetic)
+    maps = [
+        _with_external_receptions(subsystem.map, rows)
+        for subsystem, rows in zip(subsystems, external_rows, strict=True)
+    ]
+    closed_loop = interconnect_with_inputs(loop, maps, [*map(len, external_rows)], layout, numbers=arithmetic)
 
-    def spread(listed: Sequence[Placed]) -> tuple[Labels, Indices]:
-        """Return the entries of each subsystem by its peer's name, and their indices in the state."""
-        every = [
+    def in_state(signals_of_subsystems: Sequence[Placed]) -> tuple[Labels, Indices]:
+        """Return the signals of all subsystems, named by peer, and their indices in the state."""
+        entries = [
             (_named(port, peer), index + offset)
-            for ports, peer, offset in zip(listed, peers, layout.offsets, strict=True)
+            for ports, peer, offset in zip(signals_of_subsystems, peers, layout.offsets, strict=True)
             for port, index in ports
         ]
-        return tuple(port for port, _ in every), np.array([index for _, index in every], np.intp)
+        return tuple(port for port, _ in entries), np.array([index for _, index in entries], np.intp)
 
-    inputs, input_slots = spread([subsystem.inputs for subsystem in subsystems])
-    forces, computed = spread([subsystem.cuts for subsystem in subsystems])
+    inputs, input_slots = in_state([subsystem.inputs for subsystem in subsystems])
+    forces, computed = in_state([subsystem.cuts for subsystem in subsystems])
     stored = np.delete(np.arange(n), np.concatenate([input_slots, computed]))
     names = layout.names if len(subsystems) > 1 else tuple(f"{peers[0]}.{name}" for name in layout.names)
     units = {
@@ -476,10 +506,10 @@ def _closed(
         for name, subsystem in zip(peers, subsystems, strict=True)
     }
     states = tuple(ExportedSignal(name, _unit(units, name)) for name in map(names.__getitem__, stored))
-    matrix, outer = whole.matrix, slice(n, None)
+    matrix, input_columns = closed_loop.matrix, slice(n, None)
     if not open_at:
-        outputs, observed = spread([subsystem.signals for subsystem in subsystems])
-        c = (stored[None, :] == observed[:, None]).astype(np.float64)
+        outputs, signal_indices = in_state([subsystem.signals for subsystem in subsystems])
+        c = (stored[None, :] == signal_indices[:, None]).astype(np.float64)
         blocks = (
             matrix[np.ix_(stored, stored)],
             matrix[np.ix_(stored, input_slots)],
@@ -489,30 +519,37 @@ def _closed(
         return blocks, (states, inputs, outputs)
     if link:
         sent = {name: unit for item in units.values() for name, unit in item.items()}
-        forces, _ = spread([_received_ports(rows, link, sent) for rows in received])
-        back = -np.concatenate([r[rows] for r, rows in zip(whole.received, opened, strict=True)])
+        forces, _ = in_state([_received_ports(rows, link, sent) for rows in received])
+        feedback_rows = -np.concatenate(
+            [r[rows] for r, rows in zip(closed_loop.received, external_rows, strict=True)]
+        )
     else:
-        back = -matrix[computed]
+        feedback_rows = -matrix[computed]
     outputs = tuple(replace(port, name=f"{port.name} back") for port in forces)
-    blocks = matrix[np.ix_(stored, stored)], matrix[stored, outer], back[:, stored], back[:, outer]
+    blocks = (
+        matrix[np.ix_(stored, stored)],
+        matrix[stored, input_columns],
+        feedback_rows[:, stored],
+        feedback_rows[:, input_columns],
+    )
     return blocks, (states, forces, outputs)
 
 
-def _from_outside(frame_map: FrameMap, rows: Sequence[int]) -> FrameMap:
-    """Return a peer's map that has some received values as external inputs, after all others."""
+def _with_external_receptions(frame_map: FrameMap, rows: Sequence[int]) -> FrameMap:
+    """Return a peer's map with some received values as external inputs, after all others."""
     q, d = (np.concatenate([block, block[:, rows]], axis=1) for block in (frame_map.q, frame_map.d))
     q[:, rows] = d[:, rows] = 0.0
     return replace(frame_map, q=q, d=d)
 
 
 def _named(port: ExportedSignal, peer: str) -> ExportedSignal:
-    """Return a peer's port, its name with the peer's: `force on left[2].cube`."""
+    """Return a peer's signal, named with the peer: `force on left[2].cube`."""
     word, on, rest = port.name.rpartition(" on ")
     return replace(port, name=f"{word}{on}{peer}.{rest}")
 
 
 def _received_ports(received: Sequence[ReceivedSample], link: str, units: Mapping[str, str]) -> Placed:
-    """Return the received samples of a peer over a link: packet of the frame, and age in frames."""
+    """Return the received values of a peer over a link as signals, named by packet of the frame and age."""
     received = [subject for subject in received if subject.coupling_term.link == link]
     several = any(subject.sent.slot for subject in received)
     named = [
@@ -520,8 +557,8 @@ def _received_ports(received: Sequence[ReceivedSample], link: str, units: Mappin
         f"{subject.sent.channel}{f' #{subject.sent.slot + 1}' * several}({-subject.lag})"
         for subject in received
     ]
-    listed = zip(named, received, strict=True)
-    return [(ExportedSignal(name, units[subject.sent.channel]), 0) for name, subject in listed]
+    pairs = zip(named, received, strict=True)
+    return [(ExportedSignal(name, units[subject.sent.channel]), 0) for name, subject in pairs]
 
 
 def _units(peer_type: PeerType) -> dict[str, str]:
@@ -536,5 +573,5 @@ def _units(peer_type: PeerType) -> dict[str, str]:
 
 def _unit(units: Mapping[str, Mapping[str, str]], name: str) -> str:
     """Return the unit of an entry of the state, such as `user[1].coordination.x sent(-8 ms)`."""
-    peer, _, local = name.partition(".")
-    return units[peer][local.partition("(")[0].partition(" ")[0]]
+    peer, _, name_in_peer = name.partition(".")
+    return units[peer][name_in_peer.partition("(")[0].partition(" ")[0]]

@@ -6,12 +6,12 @@ forces take effect, at the scheduled tick and instant; times are rationals. Cons
 equivalent are refused by name.
 Does not: write files, or run the model.
 
-    sampled    sample(x, clock)                   the value just before the tick, as here
-    acts       hold(shiftSample(previous(f), …))  whole ticks of a delay by previous, the rest by shiftSample
-    heard      superSample(previous(sent), n)     where the clocks begin together and the delay is whole ticks
-    heard      sample(hold(shiftSample(…)))       elsewhere: available half a step of the grid of all times
-                                                  early, so that the tick at that very instant sees it, as
-                                                  sample takes the value just before
+    sampled    sample(x, clock)                   the value just before the tick, as in `simulate`
+    force      hold(shiftSample(previous(f), …))  whole ticks of a delay by previous, the rest by shiftSample
+    received   superSample(previous(sent), n)     if both clocks start together and the delay is whole ticks
+    received   sample(hold(shiftSample(…)))       otherwise: available half a step of the grid of all times
+                                                  early, so that a tick at the instant of arrival receives it,
+                                                  as sample returns the value just before the tick
 """
 
 from __future__ import annotations
@@ -28,7 +28,6 @@ from apc.compiler.compiled import ClockPartition, Model, Receive
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.files import write_text
 from apc.compiler.weights import exact_weight
-from apc.distribution import program_version
 from apc.exports.expressions import (
     NONE,
     SUM,
@@ -39,17 +38,18 @@ from apc.exports.expressions import (
     written,
 )
 from apc.exports.identifiers import identifier as word
-from apc.exports.peer_step import computing, received_by
+from apc.exports.peer_step import instant_functions, received_by
 from apc.exports.texts import filled, quoted
-from apc.frame.communication_graph import CommunicationGraph, build_exchange, check_mean
-from apc.frame.data_age import stamped
-from apc.frame.evaluation_errors import finite_equations
-from apc.frame.jacobians import jacobians
-from apc.frame.linearize import start_sends
-from apc.frame.parameters import resolve
+from apc.lifting.data_age import stamped
+from apc.linearization.evaluation_errors import finite_equations
+from apc.linearization.jacobians import jacobians
+from apc.linearization.linearize import start_sends
 from apc.network.nominal_criterion import chance, unreliable
+from apc.parameter_values.parameters import resolve
 from apc.result import Result
 from apc.simulation.trajectory import texts_of
+from apc.support.distribution import program_version
+from apc.timing.communication_graph import CommunicationGraph, build_exchange, check_mean
 
 # The largest number of received terms and variables in a file; Modelica tools flatten each of them.
 MOST_TERMS = 20_000
@@ -65,7 +65,7 @@ TIME, ZERO = Text("time", unit="s"), number(0.0)
 class ModelicaModel(Result):
     """A model as Modelica text: its `name`, its `text`, and its contents.
 
-    `clocks` are the lines that declare them.
+    `clocks` are the lines that declare its clocks.
     """
 
     shown_by = "exports_output:modelica"
@@ -84,7 +84,7 @@ def write_modelica(path: Path, modelica_model: ModelicaModel) -> None:
 
 
 def modelica(system: Model) -> ModelicaModel:
-    """Write a model in Modelica.
+    """Return a model as Modelica text.
 
     Parameters
     ----------
@@ -101,7 +101,7 @@ def modelica(system: Model) -> ModelicaModel:
 
 
 class _ModelicaWriter:
-    """Writes a model: declarations and equations as they are needed."""
+    """The text of a model: declarations and equations, added when they are needed."""
 
     def __init__(self, system: Model) -> None:
         self.system = system
@@ -116,18 +116,18 @@ class _ModelicaWriter:
         self.equations: list[str] = []
         _refuse_unsupported(system, self.exchange)
         self.clocks, self.clock_lines = self._clocks()
-        self.named: dict[Any, Text] = {}  # variables that are written once for all who need them
-        self.sent: dict[tuple[int, str], list[tuple[Text, str]]] = {}  # and its channel
+        self.named: dict[Any, Text] = {}  # variables that are declared once and used several times
+        self.sent: dict[tuple[int, str], list[tuple[Text, str]]] = {}  # sent values, with their channels
 
     def model(self) -> ModelicaModel:
-        """Return the model."""
+        """Return the complete model."""
         system, name = self.system, identifier(word(self.system.name))
         groups = [g for g, group in enumerate(system.groups) for _ in range(group.count)]
         peers = [_Peer(self, number, group) for number, group in enumerate(groups)]
         for peer in peers:
             peer.declare()
         for peer in peers:
-            self.comment(f"{peer.name}: what moves")
+            self.comment(f"{peer.name}: states")
             rates = written(peer.peer_type.derivative, [peer.x, peer.u, peer.p, [TIME]], peer.keep)
             for state, rate in zip(peer.x, rates, strict=True):
                 self.define(f"der({state.text})", rate.text)
@@ -162,7 +162,7 @@ class _ModelicaWriter:
         )
 
     def name(self, requested: str) -> str:
-        """Return a name that nothing else has, of letters that Modelica takes in quotes."""
+        """Return a name that is not used yet, quoted if Modelica requires it."""
         requested = name = "".join(
             text if text.isascii() and text.isprintable() else "_" for text in requested
         )
@@ -182,9 +182,21 @@ class _ModelicaWriter:
         fixed: bool = False,
         truth: bool = False,
     ) -> Text:
-        """Declare a variable and return it."""
+        """Declare a variable and return it.
+
+        Parameters
+        ----------
+        name, unit
+            The name in the model, and the unit in SI.
+        start, fixed
+            The start value, and whether it is fixed.
+        truth
+            Whether the variable is a Boolean.
+        """
         if len(self.declared) >= MOST_TERMS:
-            raise _refused(self.system, f"more than {MOST_TERMS:,} variables", "fewer peers: --set …")
+            raise _refused(
+                self.system, f"more than {MOST_TERMS:,} variables", "reduce the number of peers by --set"
+            )
         variable, modelica_unit = self.name(name), unit_of_modelica(unit)
         modifiers = [f'unit="{modelica_unit}"'] if modelica_unit else []
         modifiers += [f"start={start.text}"] if start is not None else []
@@ -194,23 +206,25 @@ class _ModelicaWriter:
         return Text(variable, truth=truth, unit=unit, start=start)
 
     def let(self, name: str, value: str, unit: str, start: Text | None = None) -> Text:
-        """Declare a variable that is a value, and return it."""
+        """Declare a variable, add the equation of its value, and return the variable."""
         variable = self.declare(name, unit, start)
         self.define(variable.text, value)
         return variable
 
     def like(self, variable: Text, name: str, value: str) -> Text:
-        """Declare a variable that is a value, of the unit and start of another, and return it."""
+        """Declare a variable with its value, and the unit and start of another variable; return it."""
         return self.let(name, value, variable.unit, variable.start)
 
     def define(self, variable: str, value: str) -> None:
+        """Add the equation of a variable."""
         self.equations.append(f"  {variable} = {value};")
 
     def comment(self, text: str) -> None:
+        """Add a comment between equations."""
         self.equations += ["", f"  // {text}"]
 
     def parameter(self, label: str, value: float, unit: str, description: str) -> Text:
-        """Return a parameter, which is declared once for all who share it."""
+        """Return a parameter, declared once for all its uses."""
         if label not in self.parameters:
             name, modelica_unit = self.name(label), unit_of_modelica(unit)
             modifier = f'(unit="{modelica_unit}")' if modelica_unit else ""
@@ -220,38 +234,42 @@ class _ModelicaWriter:
         return self.parameters[label][0]
 
     def sampled(self, variable: Text, clock: str) -> Text:
-        """Return a continuous value as a clock samples it."""
+        """Return the variable of a continuous value sampled by a clock."""
         key, value = (variable.text, self.clocks[clock]), f"sample({variable.text}, {self.clocks[clock]})"
         if key not in self.named:
-            bare = variable.text.strip("'").replace("\\'", "'")
-            self.named[key] = self.let(f"{bare} at {clock}", value, variable.unit)
+            unquoted = variable.text.strip("'").replace("\\'", "'")
+            self.named[key] = self.let(f"{unquoted} at {clock}", value, variable.unit)
         return self.named[key]
 
     def delayed(self, value: Text, label: str, clock: str, delay: Fraction) -> Text:
-        """Return a delayed clocked value: whole ticks by previous, the rest by shiftSample."""
-        ticks, rest = divmod(delay / self.grids[clock][0], 1)
+        """Return the variable of a delayed clocked value: whole ticks by previous, the rest by
+        shiftSample.
+        """
+        ticks, fraction = divmod(delay / self.grids[clock][0], 1)
         for count in range(int(ticks)):
-            ago = f"{label} {count + 1} tick{'s' if count else ''} ago"
-            value = self.like(value, ago, f"previous({value.text})")
-        if rest:
-            self._check(rest.numerator, rest.denominator)
-            shifted = f"shiftSample({value.text}, {rest.numerator}, {rest.denominator})"
+            delayed_name = f"{label} {count + 1} tick{'s' if count else ''} ago"
+            value = self.like(value, delayed_name, f"previous({value.text})")
+        if fraction:
+            self._check(fraction.numerator, fraction.denominator)
+            shifted = f"shiftSample({value.text}, {fraction.numerator}, {fraction.denominator})"
             value = self.like(value, f"{label} late", shifted)
         return value
 
     def received(self, sender: int, link: str, channel: int, timing: str, clock: str) -> Text:
-        """Return a delayed sent value, as sampled by another clock."""
+        """Return the variable of a delayed sent value, sampled by another clock."""
         key = (sender, link, channel, timing, self.clocks[clock])
         if key not in self.named:
             self.named[key] = self._crossing(sender, link, channel, self.numbers.timings[timing], clock)
         return self.named[key]
 
     def _crossing(self, sender: int, link: str, channel: int, delay: Fraction, clock: str) -> Text:
-        """Write how a value goes from the clock of its link to that of a force."""
+        """Return the variable of a sent value after a delay, converted from the clock of its link to
+        another clock.
+        """
         sends_at = self.clock_of[link]
         value, name = self.sent[sender, link][channel]
         label = f"{self.exchange.peer_name(sender)}.{name}"
-        after = f"{label} after {float(delay) * 1e3:.6g} ms"
+        delayed_label = f"{label} after {float(delay) * 1e3:.6g} ms"
         (slow, first), (fast, second) = self.grids[sends_at], self.grids[clock]
         if first == second and delay % slow == 0:
             value, ratio = self.delayed(value, f"{label} sent", sends_at, delay), slow / fast
@@ -259,49 +277,64 @@ class _ModelicaWriter:
                 if factor > 1:
                     self._check(factor)
                     last = operator == "subSample" or ratio.denominator == 1
-                    observed = f"{after} {'at' if last else 'for'} {clock}"
-                    value = self.like(value, observed, f"{operator}({value.text}, {factor})")
+                    name_at_clock = f"{delayed_label} {'at' if last else 'for'} {clock}"
+                    value = self.like(value, name_at_clock, f"{operator}({value.text}, {factor})")
             return value
         if not delay and (second - first) % _grid([slow, fast]) == 0:
-            message = f"{link} without delay to {clock}: their ticks meet, and begin at different times"
-            raise _refused(self.system, message, f'--set {link}.delay="…", or clocks of one phase')
-        early = delay - _grid([slow, fast, first, second, delay]) / 2 if delay else delay
-        value = self.delayed(value, f"{label} sent for {clock}", sends_at, early)
-        acting = self.like(value, f"{after} for {clock}", f"hold({value.text})")
-        return self.like(acting, f"{after} at {clock}", f"sample({acting.text}, {self.clocks[clock]})")
+            message = f"{link} without delay to {clock}: their ticks coincide but start at different times"
+            raise _refused(self.system, message, f"set a delay of {link}, or use clocks of equal phase")
+        advanced_delay = delay - _grid([slow, fast, first, second, delay]) / 2 if delay else delay
+        value = self.delayed(value, f"{label} sent for {clock}", sends_at, advanced_delay)
+        held_value = self.like(value, f"{delayed_label} for {clock}", f"hold({value.text})")
+        return self.like(
+            held_value, f"{delayed_label} at {clock}", f"sample({held_value.text}, {self.clocks[clock]})"
+        )
 
     def _check(self, *counters: int) -> None:
+        """Raise ApcError E955 for a counter beyond the range of Modelica's Integer."""
         if max(counters) > LARGEST_COUNTER:
-            message = f"a clock that counts to {max(counters):,}, more than an Integer of Modelica holds,"
-            raise _refused(self.system, message, "times that are simple multiples of one another")
+            message = f"a clock that counts to {max(counters):,}, more than the range of a Modelica Integer"
+            raise _refused(self.system, message, "use times that are simple multiples of each other")
 
     def _clocks(self) -> tuple[dict[str, str], list[str]]:
-        """Return the name of each clock, and the lines that declare them, the fastest first."""
-        used = {part.clock for peer_type in self.system.peer_types for part in peer_type.clocks}
-        used |= {
+        """Return the name of each clock, and the lines that declare the clocks, fastest first."""
+        used_clocks = {part.clock for peer_type in self.system.peer_types for part in peer_type.clocks}
+        used_clocks |= {
             self.clock_of[sending.link] for peer_type in self.system.peer_types for sending in peer_type.sends
         }
-        made: dict[tuple[Fraction, Fraction], str] = {}
+        clock_by_grid: dict[tuple[Fraction, Fraction], str] = {}
         names: dict[str, str] = {}
         lines: list[str] = []
         for clock, grid in sorted(self.grids.items(), key=lambda pair: pair[1][0]):
-            if clock not in used:
+            if clock not in used_clocks:
                 continue
-            if grid not in made:
-                made[grid] = self._clock(clock, grid, made, lines)
-            names[clock] = made[grid]
+            if grid not in clock_by_grid:
+                clock_by_grid[grid] = self._clock(clock, grid, clock_by_grid, lines)
+            names[clock] = clock_by_grid[grid]
         return names, lines
 
     def _clock(
-        self, clock: str, grid: tuple[Fraction, Fraction], made: Mapping[Any, str], lines: list[str]
+        self, clock: str, grid: tuple[Fraction, Fraction], clock_by_grid: Mapping[Any, str], lines: list[str]
     ) -> str:
-        """Write a clock, of a faster one where one begins with it; return its name."""
+        """Add the declaration of a clock, and return its name.
+
+        The clock is derived from a faster clock with the same phase if one is declared already.
+
+        Parameters
+        ----------
+        clock, grid
+            The name of the clock, and its period and phase in seconds.
+        clock_by_grid
+            The names of the clocks declared so far, by period and phase.
+        lines
+            The declarations, which are extended.
+        """
         (period, phase), name = grid, self.name(clock)
         self._check(period.numerator, period.denominator, (phase / period).denominator)
-        finer = next((item for item in made if item[1] == phase), None)
+        finer = next((item for item in clock_by_grid if item[1] == phase), None)
         value, derived = f"Clock({period.numerator}, {period.denominator})", ""
         if finer is not None:
-            ratio, value = period / finer[0], made[finer]
+            ratio, value = period / finer[0], clock_by_grid[finer]
             self._check(ratio.numerator, ratio.denominator)
             if ratio.denominator > 1:
                 base = self.name(f"{clock} divided")
@@ -309,9 +342,9 @@ class _ModelicaWriter:
                 value = base
             derived = f"subSample({value}, {ratio.numerator})"
         elif phase:
-            part, base = phase / period, self.name(f"{clock} from 0")
+            phase_ratio, base = phase / period, self.name(f"{clock} from 0")
             lines.append(f"  Clock {base} = {value};")
-            derived = f"shiftSample({base}, {part.numerator}, {part.denominator})"
+            derived = f"shiftSample({base}, {phase_ratio.numerator}, {phase_ratio.denominator})"
         description = quoted(f"every {float(period) * 1e3:.6g} ms, from {float(phase) * 1e3:.6g} ms")
         lines.append(f"  Clock {name} = {derived or value} {description};")
         return name
@@ -343,7 +376,7 @@ class _Peer:
         self.units = {clock.clock: clock.units for clock in self.peer_type.clocks}
 
     def declare(self) -> None:
-        """Declare the states, and the inputs that act on them."""
+        """Declare the states, and the outputs of holds."""
         declare, peer_type = self.writer.declare, self.peer_type
         self.x = [
             declare(f"{self.name}.{state.name}", state.unit, self.location[state.start], fixed=True)
@@ -354,25 +387,27 @@ class _Peer:
             for hold in peer_type.holds
         ]
 
-    def keep(self, long: Text) -> Text:
-        """Give a long expression a name, once while a function is written."""
+    def keep(self, expression: Text) -> Text:
+        """Declare a variable for a long expression, and return it."""
         label = f"{self.name}: part {len(self.writer.declared) + 1}"
-        part = self.writer.declare(label, truth=long.truth)
-        self.writer.define(part.text, long.text)
-        return part
+        variable = self.writer.declare(label, truth=expression.truth)
+        self.writer.define(variable.text, expression.text)
+        return variable
 
     def _sampled(self, clock: str) -> list[list[Callable[[], Text]]]:
-        """Return states, holds and time as a clock samples them, those that are needed."""
+        """Return functions that declare states, hold outputs and time as sampled by a clock, when they are
+        needed.
+        """
         sampled = self.writer.sampled
         return [
             [functools.partial(sampled, text, clock) for text in texts] for texts in (self.x, self.u, [TIME])
         ]
 
     def sends(self) -> None:
-        """Write the sends."""
+        """Add the equations of the sent values."""
         begin = start_sends(jacobians(self.peer_type), self.vector, float) if self.peer_type.sends else {}
         for sending in self.peer_type.sends:
-            self.writer.comment(f"{self.name}: what it sends over {sending.link}")
+            self.writer.comment(f"{self.name}: values sent over {sending.link}")
             x, u, t = self._sampled(self.writer.clock_of[sending.link])
             values = written(sending.send, [x, u, self.p, t], self.keep)
             starts = [number(float(item)) for item in begin[sending.link]]
@@ -382,10 +417,10 @@ class _Peer:
             self.writer.sent[self.number, sending.link] = [*zip(variables, sending.channels, strict=True)]
 
     def tick(self, partition: ClockPartition) -> None:
-        """Write the computation at a clock's ticks, and its holds."""
+        """Add the equations of a clock's ticks, and of its holds."""
         writer, name, outputs, units = self.writer, self.name, partition.outputs, partition.units
         starts = dict(zip(partition.memories, map(self.location.__getitem__, partition.starts), strict=True))
-        writer.comment(f"{name}: what it computes at {partition.clock}")
+        writer.comment(f"{name}: outputs at ticks of {partition.clock}")
         x, u, t = self._sampled(partition.clock)
         y = [
             writer.declare(f"{name}.{output}", unit, starts.get(row, ZERO))
@@ -409,7 +444,7 @@ class _Peer:
                 writer.define(acting.text, f"hold({value.text})")
 
     def _received(self, receive: Receive, clock: str, inside: Sequence[Any], t: Sequence[Any]) -> Text:
-        """Write the equations of the received values."""
+        """Return the variable of a receive: the reduction of all received values."""
         writer, link, exchange = self.writer, receive.link, self.writer.exchange
         terms, weights, unit = [], [], NONE
         for sender, inexact in received_by(writer.system, exchange, link, self.number):
@@ -445,34 +480,45 @@ class _Peer:
 
 
 def _refuse_unsupported(system: Model, exchange: CommunicationGraph) -> None:
-    """Refuse constructs that Modelica equations cannot express: ApcError E955."""
+    """Raise ApcError E955 for constructs that Modelica equations cannot express."""
     for link, law in unreliable(system):
-        message = f"{chance(link, law)}: luck that is drawn packet by packet"
-        raise _refused(system, message, "a link without it, or apc simulate")
+        message = f"{chance(link, law)}: random packet loss or delay"
+        raise _refused(system, message, "use a reliable link, or apc simulate")
     for peer_type in system.peer_types:
-        for function, _, message, _ in [(peer_type.derivative, "", "what moves", ""), *computing(peer_type)]:
+        for function, _, message, _ in [
+            (peer_type.derivative, "", "what moves", ""),
+            *instant_functions(peer_type),
+        ]:
             if not function.is_a("SXFunction"):
                 solved = (
                     f"the nonlinear loop of {peer_type.name} that Newton's method solves for {message[:120]}"
                 )
-                raise _refused(system, solved, "a coupler without a loop")
+                raise _refused(system, solved, "use a coupler without an algebraic loop")
     peers = exchange.peers
     terms = sum(
         peers * (peers - 1) if exchange.is_complete(link) else len(exchange.arcs(link)[0])
         for link in exchange.links
     )
     if max(terms, peers) > MOST_TERMS:
-        message = f"{peers:,} peers, who hear {terms:,} times of one another, one by one"
-        raise _refused(system, message, f"fewer peers: --set {system.groups[0].name}.count=10")
+        message = f"{peers:,} peers with {terms:,} directed connections"
+        raise _refused(
+            system, message, f"reduce the number of peers, such as by --set {system.groups[0].name}.count=10"
+        )
 
 
-def _refused(system: Model, subject: str, hint: str) -> ApcError:
+def _refused(system: Model, subject: str, advice: str) -> ApcError:
+    """Return error E955 for a construct without a Modelica equivalent."""
     return ApcError(
-        Diagnostic("E955", SourceLocation(system.origin.topology), f"not in Modelica: {subject}", hint=hint)
+        Diagnostic(
+            "E955",
+            SourceLocation(system.origin.topology),
+            f"no Modelica equivalent of {subject}",
+            advice=advice,
+        )
     )
 
 
 def _grid(times: Sequence[Fraction]) -> Fraction:
-    """Return the largest time that all of some times are whole multiples of."""
+    """Return the largest time of which all given times are whole multiples."""
     whole = math.lcm(*(time.denominator for time in times))
     return Fraction(math.gcd(*(int(time * whole) for time in times)), whole)

@@ -2,7 +2,7 @@
 
 Takes: a `Model`, a peer of it, an integration method between events.
 Gives: `ExportedPeer`, `peer_of`, `subsystems_of`, `lines_of`, `first_packet`, `received_by`, `has_edge`,
-`computing`, `refused`; its parts `Instant`, `ForceUpdate`, `PeerLink`, `Sender`, `Force`, `Move`.
+`instant_functions`, `refused`; its parts `Instant`, `ForceUpdate`, `PeerLink`, `Sender`, `Force`, `Move`.
 Guarantees: the functions, transitions and instants are those of `simulate`. Computations other than finite
 arithmetic are refused, with the name of the state or variable.
 Does not: write anything (see `c_text`), or transfer packets between peers (see `topology_text`).
@@ -31,25 +31,25 @@ from apc.compiler.errors import ApcError, Diagnostic, SourceLocation, nearest
 from apc.compiler.interpolation import jacobian
 from apc.compiler.language.vectors import whole_and_index
 from apc.exports.identifiers import identifier, prefixed
-from apc.frame import schedule as frames
-from apc.frame.communication_graph import CommunicationGraph
-from apc.frame.devices import Device, coupled_directly, find_device, find_devices
-from apc.frame.discretize import moved_together
-from apc.frame.exact_arithmetic import evaluate_exact
-from apc.frame.jacobians import SubsystemJacobians, edge_name, structural_pattern
-from apc.frame.linearize import start_arguments, start_values
-from apc.frame.parameters import exact_numbers
-from apc.frame.schedule import Schedule
+from apc.lifting.devices import Device, coupled_directly, find_device, find_devices
+from apc.lifting.discretize import coupled_states
+from apc.linearization.jacobians import SubsystemJacobians, edge_name, structural_pattern
+from apc.linearization.linearize import start_arguments, start_values
+from apc.parameter_values.exact_arithmetic import evaluate_exact
+from apc.parameter_values.parameters import exact_numbers
 from apc.simulation.flow import flow_of, rows_to_move, state_scales
 from apc.simulation.program import timed_events
 from apc.simulation.propagate import rates, transition_rows
 from apc.simulation.settings import Method
 from apc.simulation.signals import LocalSignal, local_signals
 from apc.simulation.simulation import SimulationPlan
+from apc.timing import schedule as frames
+from apc.timing.communication_graph import CommunicationGraph
+from apc.timing.schedule import Schedule
 
-NO_DEVICE = "none"  # the word for a peer that moves nothing outside its computer
+NO_DEVICE = "none"  # the name of the device of a peer whose states are all in its computer
 MOST_RECEIVED = 20_000  # senders to one peer: each is a line of the text
-STEPS = "--method rk4:0.1ms"  # a method that is arithmetic, whatever moves
+STEPS = "--method rk4:0.1ms"  # a method of finite arithmetic for any equations
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +62,7 @@ class ForceUpdate:
 
 @dataclass(frozen=True, slots=True)
 class Instant:
-    """The simultaneous events of an instant, in order; followed by the `move`-th interval of the peer.
+    """The simultaneous events of an instant, in order, followed by interval `move` of the peer.
 
     `sends` and `ticks` are partitions.
     """
@@ -75,7 +75,7 @@ class Instant:
 
 @dataclass(frozen=True, slots=True)
 class Sender:
-    """Another peer, by number, that is received: its name, and the weights of its packets.
+    """Another peer that sends to this one: its number and name, and the weight of its packets.
 
     `start` are the values used before its first packet arrives, one number per channel.
     """
@@ -99,8 +99,8 @@ class PacketEntry:
 class PeerLink:
     """A link of one peer: packet contents, senders, and whether packets can be missing.
 
-    In C the line is called `name`. `sending` is the peer's own send partition, −1 if it does not send;
-    `complete` is whether the graph is complete.
+    Its C name is `name`. `sending` is the peer's own send partition, −1 if it does not send; `complete`
+    states whether the graph is complete.
     """
 
     link: str
@@ -129,7 +129,7 @@ class Force:
 class Move:
     """The motion of the computer's states over `quanta`: x⁺ = matrix · (x, u, 1) row by row, or by `flow`.
 
-    `flow` (x, u, p, t) -> x⁺ is of the states `flowing`.
+    `flow` (x, u, p, t) -> x⁺ is the transition of the states `flowing`.
     """
 
     quanta: int
@@ -140,13 +140,13 @@ class Move:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ExportedPeer:
-    """A peer. `number` is its zero-based index over all groups; `parameters` (n_p,) are its type's.
+    """A peer. `number` is its zero-based index over all groups; `parameters` (n_p,) are those of its type.
 
-    In C it is called `identifier`. `outside` are the states that its computer does not integrate, `measured`
-    the measured ones of them by C name, and `forces` likewise. `channels` are, by clock partition and
-    receive, the indices of the received channels on its line; an unused receive has none. `start` are the
-    start states, `memories` the start values of each clock partition's stored outputs. `settable` are the
-    indices of the parameters used only in ticks, see `_settable`.
+    Its C name is `identifier`. `outside` are the states that its computer does not integrate, `measured` the
+    measured states of these by C name, and `forces` the forces on them by C name. `channels` are, by clock
+    partition and receive, the indices of the received channels in the packet; an unused receive has none.
+    `start` are the start states, `memories` the start values of each clock partition's stored outputs.
+    `settable` are the indices of the parameters used only in ticks (see `_settable`).
     """
 
     system: Model
@@ -169,18 +169,18 @@ class ExportedPeer:
 
     @property
     def signals(self) -> tuple[LocalSignal, ...]:
-        """The readable variables: integrated states, computed values, pending values."""
+        """The readable variables: integrated states, computed values, values still to take effect."""
         outside = {("state", (row,)) for row in self.outside}
-        every = local_signals(self.peer_type, self.schedule)
+        all_signals = local_signals(self.peer_type, self.schedule)
         return tuple(
             local_signal
-            for local_signal in every
+            for local_signal in all_signals
             if local_signal.role != "limited" and (local_signal.role, local_signal.index) not in outside
         )
 
     @property
     def sending(self) -> tuple[PeerLink, ...]:
-        """The lines over which it sends."""
+        """The links over which the peer sends."""
         return tuple(line for line in self.lines if line.sending >= 0)
 
     def line(self, link: str) -> PeerLink:
@@ -191,7 +191,7 @@ class ExportedPeer:
 def peer_of(
     plan: SimulationPlan, number: int, method: Method, *, device: str | None = NO_DEVICE, name: str = ""
 ) -> ExportedPeer:
-    """Extract a peer from its model.
+    """Return a peer of a model, with the equations and packets of its own computer.
 
     Parameters
     ----------
@@ -202,7 +202,7 @@ def peer_of(
     method
         The integration method of states without an exact transition.
     device
-        The part outside the computer, `NO_DEVICE` if none; None: the set that is not sent to others.
+        The part outside the computer, `NO_DEVICE` without one; None: the states that are not sent to others.
     name
         The C name; by default derived from the peer's name.
 
@@ -217,13 +217,13 @@ def peer_of(
     peer_type, subsystem, schedule = system.peer_types[index], plan.subsystems[index], plan.schedules[group]
     vector, label = _parameters(plan, number), plan.exchange.peer_name(number)
     _refuse_iterations(system, label, peer_type)
-    outside = _outside(system, label, subsystem, vector, device)
+    outside = _external_states(system, label, subsystem, vector, device)
     instants, lengths = _instants(schedule)
     lines, channels = lines_of(plan, number)
-    evaluated_at = sorted(outside & _read(peer_type))
+    evaluated_at = sorted(outside & _states_read(peer_type))
     measured = prefixed("measured", (peer_type.states[row].name for row in evaluated_at))
     forces = _forces(system, label, subsystem, vector, outside)
-    pushed = prefixed("force", (force.name for force in forces))
+    force_names = prefixed("force", (force.name for force in forces))
     x, _, memories = start_values(subsystem, [float(item) for item in vector])
     return ExportedPeer(
         system=system,
@@ -235,11 +235,11 @@ def peer_of(
         parameters=vector,
         outside=outside,
         measured=dict(zip(evaluated_at, measured, strict=True)),
-        forces=dict(zip(pushed, forces, strict=True)),
+        forces=dict(zip(force_names, forces, strict=True)),
         lines=lines,
         channels=channels,
         instants=instants,
-        moves=_moves(plan, label, group, outside, lengths, method, vector),
+        moves=_transitions(plan, label, group, outside, lengths, method, vector),
         start=tuple(x),
         memories=tuple(map(tuple, memories)),
         settable=_settable(peer_type),
@@ -247,25 +247,29 @@ def peer_of(
 
 
 def _parameters(plan: SimulationPlan, number: int) -> Any:
-    """Return a peer's vector (n_p,) of parameters."""
+    """Return the parameters (n_p,) of a peer."""
     group = plan.exchange.group_of(number)
     row = plan.numbers.rows[group][number - int(plan.exchange.starts[group])]
     return plan.numbers.parameters[group][int(row)]
 
 
 def _settable(peer_type: PeerType) -> tuple[int, ...]:
-    """Return the indices of the parameters used only in ticks, not in transitions or start values."""
-    ticks = [
+    """Return the indices of the parameters that can be set while the exported peer runs.
+
+    They are used only in ticks, not in derivatives, sent values or start values.
+    """
+    tick_functions = [
         function
         for clock in peer_type.clocks
         for function in (clock.tick, *(each.edge for each in clock.receives))
         if function
     ]
-    others = [peer_type.derivative, *(sending.send for sending in peer_type.sends)]
-    fixed = {state.start for state in peer_type.states} | {
+    motion_functions = [peer_type.derivative, *(sending.send for sending in peer_type.sends)]
+    start_parameters = {state.start for state in peer_type.states} | {
         start for clock in peer_type.clocks for start in clock.starts
     }
-    read, moves = (
+    # The parameters are the second-to-last argument of each function.
+    used_in_ticks, used_elsewhere = (
         np.any(
             [
                 structural_pattern(function.jac_sparsity(0, function.n_in() - 2)).any(axis=0)
@@ -273,14 +277,14 @@ def _settable(peer_type: PeerType) -> tuple[int, ...]:
             ],
             axis=0,
         )
-        for functions in (ticks, others)
+        for functions in (tick_functions, motion_functions)
     )
-    indices = np.flatnonzero(read & ~moves).tolist()
-    return tuple(index for index in indices if peer_type.parameters[index] not in fixed)
+    indices = np.flatnonzero(used_in_ticks & ~used_elsewhere).tolist()
+    return tuple(index for index in indices if peer_type.parameters[index] not in start_parameters)
 
 
 def subsystems_of(plan: SimulationPlan) -> tuple[int, ...]:
-    """Return for every peer the first one of its group with equal parameters and weights."""
+    """Return, for each peer, the first peer of its group with equal parameters and weights."""
     first: dict[Any, int] = {}
     numbers = []
     graphs = [link for link in plan.exchange.links if not plan.exchange.is_complete(link)]
@@ -294,29 +298,43 @@ def subsystems_of(plan: SimulationPlan) -> tuple[int, ...]:
     return tuple(numbers)
 
 
-def refused(system: Model, message: str, hint: str = "", code: str = "E960") -> ApcError:
-    """Return the message for an expression that cannot be written in C."""
-    return ApcError(Diagnostic(code, SourceLocation(system.origin.topology), message, hint=hint))
+def refused(system: Model, message: str, fix: str = "", code: str = "E960", *, advice: str = "") -> ApcError:
+    """Return the error for a peer that cannot be exported as C.
+
+    Parameters
+    ----------
+    system
+        The model.
+    message, fix, code, advice
+        The fields of the diagnostic.
+    """
+    return ApcError(Diagnostic(code, SourceLocation(system.origin.topology), message, fix=fix, advice=advice))
 
 
 def _refuse_iterations(system: Model, name: str, peer_type: PeerType) -> None:
-    """Refuse a peer of which something is solved by Newton's method."""
-    for function, when, message, where in computing(peer_type):
+    """Raise ApcError E960 for a peer with equations solved by Newton's method, or without ticks."""
+    for function, when, message, where in instant_functions(peer_type):
         if not function.is_a("SXFunction"):
-            message = f"{name}: {when}{message}{where} are solved for by iteration, which is not written as C"
-            raise refused(system, message, "equations that can be solved for these")
+            message = f"{name}: {when}{message}{where} need an iteration, which is not exported to C"
+            raise refused(system, message, advice="write equations that can be solved for them")
     if not peer_type.clocks:
-        message = f"{name} computes nothing at any tick of a clock: there is nothing to write as C"
+        message = f"{name} computes nothing at ticks of a clock, so there is no C code"
         raise refused(system, message)
 
 
-# ---- what moves outside
+# ---- states outside the computer
 
 
-def _outside(
+def _external_states(
     system: Model, name: str, subsystem: SubsystemJacobians, vector: Any, device: str | None
 ) -> frozenset[int]:
-    """Return the states that the peer's computer does not move."""
+    """Return the states that the peer's computer does not integrate: those of its devices.
+
+    Raises
+    ------
+    ApcError
+        E961 no such part, no device, several possible devices, or a device coupled to an object copy.
+    """
     peer_type = subsystem.peer_type
     if device == NO_DEVICE:
         return frozenset()
@@ -324,44 +342,44 @@ def _outside(
     masses = {part for row, part in enumerate(parts) if _is_position(peer_type, subsystem, row)}
     sent = {parts[int(row)] for send in subsystem.pattern.sends for row in np.flatnonzero(send.x.any(axis=0))}
     pattern = structural_pattern(peer_type.derivative.jac_sparsity(0, 0)).astype(float)
-    tied = [set(rows.tolist()) for rows in moved_together(pattern)]
+    coupled_sets = [set(rows.tolist()) for rows in coupled_states(pattern)]
     if device is not None:
         chosen = {part.strip() for part in device.split(",")}
         for mass in sorted(chosen - masses):
             near = nearest(mass, masses) or min(masses, default=NO_DEVICE)
-            message = f"--device: no mass of {name} is called {mass[:40] or 'so'}"
+            message = f"--device: unknown mass {mass[:40]!r} of {name}"
             raise refused(system, message, f"--device {near}", "E961")
     else:
         unit_of = {parameter.name: parameter.unit for parameter in system.parameters}
         devices = find_devices(subsystem, vector, unit_of, direct=coupled_directly(system.peer_types))
-        chosen = {device.rpartition(".")[0] if device.endswith("]") else device for device in devices}
+        chosen = {text.rpartition(".")[0] if text.endswith("]") else text for text in devices}
     if not chosen:
-        hint = f"--device {NO_DEVICE} if its computer moves them all, or --device "
-        message = f"{name} has no device: others are told of every mass of it"
-        raise refused(system, message, hint + min(masses, default=NO_DEVICE), "E961")
+        fix = f"--device {NO_DEVICE}, or --device {min(masses, default=NO_DEVICE)}"
+        message = f"{name} has no device: each of its masses is sent to other peers"
+        raise refused(system, message, fix, "E961")
     listed = sorted(chosen)
     if device is None and not peer_type.held and len(listed) > 1:
-        message = f"{name}: {' and '.join(listed)} may be devices, or copies that its computer moves"
-        raise refused(system, message, f"--device {','.join(listed)} or --device {listed[0]}", "E961")
+        message = f"{name}: {' and '.join(listed)} may be devices or object copies"
+        raise refused(system, message, f"--device {','.join(listed)}, or --device {listed[0]}", "E961")
     outside: set[int] = set()
-    for rows in tied:
+    for rows in coupled_sets:
         inside = {parts[row] for row in rows}
         if not inside & chosen:
             continue
         if copies := sorted((inside & sent) - chosen):
             moving, copied = " and ".join(sorted(inside & chosen)), " and ".join(copies)
             message = (
-                f"{name}: {moving} and {copied} are tied to each other between ticks: no computer can move "
-                f"{copied} where {moving} moves by itself"
+                f"{name}: {moving} and {copied} are coupled between ticks, so {copied} can't be computed "
+                f"while {moving} is a physical device"
             )
-            hint = f"a part with a clock between them, as SampledSpringDamper, or --device {NO_DEVICE}"
-            raise refused(system, message, hint, "E961")
+            advice = "connect them by a part with a clock, such as SampledSpringDamper"
+            raise refused(system, message, f"--device {NO_DEVICE}", "E961", advice=advice)
         outside |= rows
     return frozenset(outside)
 
 
 def _is_position(peer_type: PeerType, subsystem: SubsystemJacobians, row: int) -> bool:
-    """Return whether a state is a position, with another state as its rate, as of a mass."""
+    """Return whether a state is the position of a mass: its rate is another state."""
     return (
         peer_type.states[row].unit == "m"
         and subsystem.pattern.a[row].sum() == 1
@@ -369,10 +387,11 @@ def _is_position(peer_type: PeerType, subsystem: SubsystemJacobians, row: int) -
     )
 
 
-def _read(peer_type: PeerType) -> frozenset[int]:
-    """Return the states that anything computed at an instant looks at."""
+def _states_read(peer_type: PeerType) -> frozenset[int]:
+    """Return the states that any function evaluated at an instant depends on."""
     reads = [
-        structural_pattern(function.jac_sparsity(0, 0)).any(axis=0) for function, *_ in computing(peer_type)
+        structural_pattern(function.jac_sparsity(0, 0)).any(axis=0)
+        for function, *_ in instant_functions(peer_type)
     ]
     return frozenset(np.flatnonzero(np.any(reads, axis=0)).tolist())
 
@@ -380,7 +399,7 @@ def _read(peer_type: PeerType) -> frozenset[int]:
 def _forces(
     system: Model, name: str, subsystem: SubsystemJacobians, vector: Any, outside: frozenset[int]
 ) -> tuple[Force, ...]:
-    """Return the forces on the devices, as sums of hold outputs."""
+    """Return the forces on the devices, as sums of hold outputs times factors."""
     peer_type = subsystem.peer_type
     if not outside:
         return ()
@@ -399,24 +418,24 @@ def _forces(
         state = peer_type.states[row].name
         axis = slopes[velocity, :]
         if casadi.depends_on(axis, varying):
-            message = f"{name}: what pushes {state} is no sum of what ticks compute: it bends with the motion"
-            hint = "a motor without a limit, which the real one has"
-            raise refused(system, message, hint, "E961")
+            message = f"{name}: the force on {state} is not a sum of values computed at ticks"
+            advice = "use a motor without a limit; the real motor has one"
+            raise refused(system, message, code="E961", advice=advice)
         device = find_device(subsystem, vector, unit_of, part=state)
         if not isinstance(device, Device):
-            raise refused(system, f"{name}: {device or f'{state} is no mass'}", code="E961")
+            raise refused(system, f"{name}: {device or f'{state} is not a mass'}", code="E961")
         function = casadi.Function("slopes", [x, u, p, t], [casadi.densify(axis)])
         values = evaluate_exact(function, [numbers[0], numbers[1], numbers[4], numbers[5]])[0]
         terms = tuple((h, float(value / device.inverse)) for h, value in enumerate(values) if value)
-        part, _, local = state.rpartition(".")
-        forces.append(Force(f"{part}.f{local.removeprefix(whole_and_index(local)[0])}", terms))
+        part, _, state_suffix = state.rpartition(".")
+        forces.append(Force(f"{part}.f{state_suffix.removeprefix(whole_and_index(state_suffix)[0])}", terms))
     return tuple(forces)
 
 
-# ---- what moves inside
+# ---- states of the computer
 
 
-def _moves(
+def _transitions(
     plan: SimulationPlan,
     name: str,
     group: int,
@@ -425,7 +444,7 @@ def _moves(
     method: Method,
     vector: Any,
 ) -> tuple[Move, ...]:
-    """Return the transitions of the computer's states for every interval length, in quanta."""
+    """Return the transitions of the computer's states for every interval length in quanta."""
     system, index = plan.system, plan.system.groups[group].peer_type
     peer_type, subsystem, quantum = (
         system.peer_types[index],
@@ -435,13 +454,13 @@ def _moves(
     flowing = [row for row in rows_to_move(peer_type, method) if row not in outside]
     names = ", ".join(peer_type.states[row].name for row in flowing)
     if flowing and method.step is None:
-        message = f"{name}: between ticks {names} move by CVODES, which is not written as C"
+        message = f"{name}: {names} are integrated by CVODES between ticks, which is not exported to C"
         raise refused(system, message, STEPS)
     if flowing and not peer_type.derivative.is_a("SXFunction"):
-        message = f"{name}: the rates of {names} are solved for by iteration, which is not written as C"
-        raise refused(system, message, "equations that can be solved for these")
-    every = zip(system.groups, plan.numbers.parameters, strict=True)
-    numbers = [row for group, rows in every if group.peer_type == index for row in rows]
+        message = f"{name}: the rates of {names} need an iteration, which is not exported to C"
+        raise refused(system, message, advice="write equations that can be solved for them")
+    groups_with_rows = zip(system.groups, plan.numbers.parameters, strict=True)
+    numbers = [row for item, rows in groups_with_rows if item.peer_type == index for row in rows]
     flow = flow_of(peer_type, method, flowing, state_scales(system, peer_type, subsystem, numbers))
     linear = rates(peer_type, [*sorted(outside), *flowing])
     if linear.timed:
@@ -449,34 +468,34 @@ def _moves(
         g = linear.rate(*inputs)
         rows = [row for row in range(g.numel()) if casadi.depends_on(g[row], inputs[1])]
         pushed = ", ".join(peer_type.states[row].name for row in rows)
-        message = f"{name}: {pushed} is pushed by a force that changes with time between ticks"
-        raise refused(system, f"{message}; its exact integral is not written as C", STEPS)
+        message = f"{name}: the force on {pushed} depends on time between ticks"
+        raise refused(system, f"{message}; its exact integral is not exported to C", STEPS)
     seconds = [length * quantum for length in lengths]
     matrices = transition_rows(linear, vector[None], seconds)
     moves = []
     for length, duration, matrix in zip(lengths, seconds, matrices, strict=True):
         function = flow.over(duration) if flow is not None else None
         if function is not None and not function.is_a("SXFunction"):
-            message = f"{name}: {names} take too many steps of {method} from one instant to the next"
-            raise refused(system, f"{message} to be written", STEPS)
+            message = f"{name}: {names} need too many steps of {method} between two events"
+            raise refused(system, message, STEPS)
         moves.append(Move(length, matrix[0], tuple(flowing), function))
     return tuple(moves)
 
 
 def _instants(schedule: Schedule) -> tuple[tuple[Instant, ...], tuple[int, ...]]:
-    """Return the instants of a frame, and the lengths of time between them in quanta."""
+    """Return the instants of a frame, and the distinct interval lengths between them in quanta."""
     lengths = sorted({event.duration for event in schedule.events if isinstance(event, frames.Propagate)})
     ticked: Counter[int] = Counter()
     instants = []
-    for _, group in groupby(timed_events(schedule), itemgetter(0)):  # each ends with a length of time
-        *listed, move = (event for _, event in group)
+    for _, group in groupby(timed_events(schedule), itemgetter(0)):  # each group ends with a propagation
+        *simultaneous, move = (event for _, event in group)
         assert isinstance(move, frames.Propagate), "an instant is over when time goes on"
-        ticks = tuple(tick.partition for tick in listed if isinstance(tick, frames.Tick))
+        ticks = tuple(tick.partition for tick in simultaneous if isinstance(tick, frames.Tick))
         ticked.update(ticks)
-        acts = [(act.hold, act.value) for act in listed if isinstance(act, frames.HoldUpdate)]
+        acts = [(act.hold, act.value) for act in simultaneous if isinstance(act, frames.HoldUpdate)]
         instants.append(
             Instant(
-                tuple(send.partition for send in listed if isinstance(send, frames.SendEvent)),
+                tuple(send.partition for send in simultaneous if isinstance(send, frames.SendEvent)),
                 ticks,
                 tuple(ForceUpdate(hold, ticked[value.partition] - 1 - value.index) for hold, value in acts),
                 lengths.index(move.duration),
@@ -491,7 +510,7 @@ def _instants(schedule: Schedule) -> tuple[tuple[Instant, ...], tuple[int, ...]]
 def lines_of(
     plan: SimulationPlan, number: int
 ) -> tuple[tuple[PeerLink, ...], dict[tuple[int, int], tuple[int, ...]]]:
-    """Return the links of a peer, and for every receive the places of its channels on its line."""
+    """Return the links of a peer, and for each receive the indices of its channels in the packet."""
     system, exchange, group = plan.system, plan.exchange, plan.exchange.group_of(number)
     subsystem, schedule = plan.subsystems[system.groups[group].peer_type], plan.schedules[group]
     peer_type = subsystem.peer_type
@@ -506,12 +525,12 @@ def lines_of(
     indices: dict[tuple[int, int], tuple[int, ...]] = {}
     for name, (link, declared) in zip(prefixed("link", exchange.links), exchange.links.items(), strict=True):
         sent = {sent.channel for sent in schedule.sent if sent.link == link}
-        of = {
+        channels_by_receive = {
             key: subsystem.pattern.ticks[key[0]].channels[key[1]]
             for key, text in read.items()
             if text == link
         }
-        receives = {channel for channels in of.values() for channel in channels}
+        receives = {channel for channels in channels_by_receive.values() for channel in channels}
         if not receives and not sent:
             continue
         index, send_partition = next(
@@ -520,27 +539,33 @@ def lines_of(
             for index, send in enumerate(each.sends)
             if send.link == link
         )
-        used = [i for i, channel in enumerate(send_partition.channels) if i in receives or channel in sent]
-        indices |= {key: tuple(map(used.index, channels)) for key, channels in of.items()}
-        channels = tuple(send_partition.channels[i] for i in used)
+        used_channels = [
+            i for i, channel in enumerate(send_partition.channels) if i in receives or channel in sent
+        ]
+        indices |= {
+            key: tuple(map(used_channels.index, channels)) for key, channels in channels_by_receive.items()
+        }
+        channels = tuple(send_partition.channels[i] for i in used_channels)
         members = prefixed("value", channels)
         senders = [*received_by(plan.system, plan.exchange, link, number)] if receives else []
         if len(senders) > MOST_RECEIVED:
-            message = f"{exchange.peer_name(number)} hears {len(senders):,} peers over {link}"
-            message = f"{message}; {MOST_RECEIVED:,} fit a text of C"
-            raise refused(system, message, "fewer peers, or a graph that is not complete")
+            message = f"{exchange.peer_name(number)} receives from {len(senders):,} peers over {link}"
+            message = f"{message}; the limit of the C export is {MOST_RECEIVED:,}"
+            raise refused(system, message, advice="reduce the number of peers, or use a sparse graph")
         law = declared.channel
         lines.append(
             PeerLink(
                 link=link,
                 name=name,
-                packet=tuple(map(PacketEntry, channels, [send_partition.units[i] for i in used], members)),
+                packet=tuple(
+                    map(PacketEntry, channels, [send_partition.units[i] for i in used_channels], members)
+                ),
                 sending=index if sent else -1,
                 senders=tuple(
                     Sender(
-                        number, exchange.peer_name(number), weight, first_packet(plan, link, number, channels)
+                        sender, exchange.peer_name(sender), weight, first_packet(plan, link, sender, channels)
                     )
-                    for number, weight in senders
+                    for sender, weight in senders
                 ),
                 missing=law is not None and law.on_loss == "zero" and bool(senders),
                 complete=exchange.is_complete(link),
@@ -550,12 +575,12 @@ def lines_of(
 
 
 def first_packet(plan: SimulationPlan, link: str, number: int, channels: Sequence[str]) -> tuple[float, ...]:
-    """Return the values used for a peer over a link before its first packet arrives, channel by channel."""
+    """Return the values used for a sender before its first packet arrives, one per channel."""
     subsystem = plan.subsystems[plan.system.groups[plan.exchange.group_of(number)].peer_type]
     sent: dict[str, float] = {}
     for sending in subsystem.peer_type.sends:
         if sending.link == link:
-            vector = [float(matrix) for matrix in _parameters(plan, number)]
+            vector = [float(parameter) for parameter in _parameters(plan, number)]
             x, u, _ = start_values(subsystem, vector)
             values = np.asarray(sending.send(x, u, vector, 0.0), np.float64).ravel().tolist()
             sent = dict(zip(sending.channels, values, strict=True))
@@ -565,26 +590,26 @@ def first_packet(plan: SimulationPlan, link: str, number: int, channels: Sequenc
 def received_by(
     system: Model, exchange: CommunicationGraph, link: str, number: int
 ) -> Iterator[tuple[int, float]]:
-    """Yield the senders to a peer over a link, with their weights, in the model's order."""
+    """Yield the senders to a peer over a link, with their weights, in the order of peers."""
     if exchange.is_complete(link):
-        listed = [(index, 1.0) for index in range(exchange.peers) if index != number]
+        senders = [(index, 1.0) for index in range(exchange.peers) if index != number]
     else:
         pairs, weights = exchange.arcs(link)
-        mine = np.flatnonzero(pairs[:, 1] == number)
-        listed = sorted(zip(pairs[mine, 0].tolist(), weights[mine].tolist(), strict=True))
+        own_rows = np.flatnonzero(pairs[:, 1] == number)
+        senders = sorted(zip(pairs[own_rows, 0].tolist(), weights[own_rows].tolist(), strict=True))
     peer_types = [system.peer_types[group.peer_type] for group in system.groups]
     sends = [any(sending.link == link for sending in peer_type.sends) for peer_type in peer_types]
-    return ((number, weight) for number, weight in listed if sends[exchange.group_of(number)])
+    return ((sender, weight) for sender, weight in senders if sends[exchange.group_of(sender)])
 
 
-def computing(peer_type: PeerType) -> list[tuple[Any, str, str, str]]:
-    """Return all computations of a peer at instants: function, time, results, link."""
+def instant_functions(peer_type: PeerType) -> list[tuple[Any, str, str, str]]:
+    """Return all functions of a peer evaluated at instants: function, time, results and link in words."""
     result = [
         (clock.tick, f"at a tick of {clock.clock} ", ", ".join(clock.outputs), "")
         for clock in peer_type.clocks
     ]
     edges = [each.edge for clock in peer_type.clocks for each in clock.receives if each.edge is not None]
-    result += [(edge, "", "a look at others", "") for edge in edges]
+    result += [(edge, "", "an edge function", "") for edge in edges]
     return [
         *result,
         *((send.send, "", ", ".join(send.channels), f" of {send.link}") for send in peer_type.sends),
@@ -592,6 +617,6 @@ def computing(peer_type: PeerType) -> list[tuple[Any, str, str, str]]:
 
 
 def has_edge(peer_type: PeerType, partition: int, receive: int) -> bool:
-    """Return whether a receive is a pairwise reduction."""
+    """Return whether a receive has an edge function."""
     clock = peer_type.clocks[partition]
     return bool(edge_name(clock, clock.receives[receive]))

@@ -1,8 +1,8 @@
-"""A state space as python-control's, and as files that Python, SciPy and MATLAB read.
+"""A state space as an object of python-control, and as files that Python, SciPy and MATLAB read.
 
 Takes: a `StateSpace`. Gives: `as_control`; `write_script`, `write_mat`, `write_npz`.
-Guarantees: a file is there whole or not at all; no name out of a model is read as Python's text; nothing is
-pickled. All hold the same: A, B, C, D, dt in seconds, names and SI units, and what made them.
+Guarantees: a file is written completely or not at all; no name of a model is executed as Python code; nothing
+is pickled. All contain the same: A, B, C, D, dt in seconds, names and SI units, and the provenance.
 Does not: compute.
 """
 
@@ -17,7 +17,7 @@ from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.files import write_file, write_text
 from apc.exports.identifiers import ExportedSignal, identifier, words
 from apc.exports.texts import filled
-from apc.optional import need
+from apc.support.optional import need
 
 if TYPE_CHECKING:
     from apc.exports.lifted import StateSpace
@@ -38,7 +38,7 @@ def as_control(state_space: StateSpace) -> Any:
 
 
 def write_script(path: Path, state_space: StateSpace) -> None:
-    """Write a Python script that makes a `control.StateSpace`. Raises ApcError (E601)."""
+    """Write a Python script that creates a `control.StateSpace`. Raises ApcError (E601)."""
     text = filled(
         "control.jinja",
         state_space=state_space,
@@ -51,17 +51,17 @@ def write_script(path: Path, state_space: StateSpace) -> None:
 
 
 def write_mat(path: Path, state_space: StateSpace) -> None:
-    """Write a MAT-file. Raises ApcError: E601 where it can't be, E951 where it is too large."""
+    """Write a MAT-file. Raises ApcError: E601 if it cannot be written, E951 if a variable is too large."""
     if max(matrix.nbytes for matrix in state_space.matrices) > LARGEST_MAT:
-        message = "a variable of a MAT-file holds less than 2 GiB, and A is larger"
-        raise ApcError(Diagnostic("E951", SourceLocation(str(path)), message, hint="--to npz"))
+        message = "A is larger than 2 GiB, the limit of a variable in a MAT-file"
+        raise ApcError(Diagnostic("E951", SourceLocation(str(path)), message, fix="--to npz"))
     from scipy.io import savemat
 
     variables = {
         name: np.array(item, dtype=object).reshape(-1, 1) if isinstance(item, list) else item
         for name, item in _variables(state_space).items()
     }
-    # The name has another suffix until the file is whole, and SciPy would add its own.
+    # The temporary file has another suffix, and SciPy would append its own.
     write_file(path, lambda temporary: savemat(temporary, variables, appendmat=False, do_compression=True))
 
 
@@ -73,14 +73,15 @@ def write_npz(path: Path, state_space: StateSpace) -> None:
     }
 
     def write(temporary: Path) -> None:
-        with temporary.open("wb") as file:  # NumPy would add its suffix to a name
+        """Write the arrays to a temporary file."""
+        with temporary.open("wb") as file:  # NumPy would append its suffix to a file name
             np.savez_compressed(file, **arrays)
 
     write_file(path, write)
 
 
 def _named(state_space: StateSpace) -> list[tuple[str, tuple[ExportedSignal, ...]]]:
-    """Return the names in a state space, by category."""
+    """Return the signals of a state space by category: states, inputs and outputs."""
     return [("states", state_space.states), ("inputs", state_space.inputs), ("outputs", state_space.outputs)]
 
 

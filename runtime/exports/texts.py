@@ -30,23 +30,29 @@ def filled(file: str, /, **values: object) -> str:
 
 @functools.cache
 def _templates() -> Environment:
-    made = Environment(
+    """Return the environment of Jinja2 with this folder's templates and filters, cached."""
+    environment = Environment(
         loader=FileSystemLoader(Path(__file__).parent),
         variable_start_string="${",
         variable_end_string="}",
         line_statement_prefix="%",
         keep_trailing_newline=True,
         undefined=StrictUndefined,
-        autoescape=False,  # no text of it is read by a browser
+        autoescape=False,  # the texts are not HTML
     )
-    made.filters |= {"number": number, "comment": comment, "row": row, "members": _members}
-    made.filters |= {"attribute": quoteattr, "json": json.dumps, "fill": textwrap.fill, "quotable": quotable}
-    made.filters |= {"line": line_of, "quoted": quoted}
-    return made
+    environment.filters |= {"number": number, "comment": comment, "row": row, "members": _members}
+    environment.filters |= {
+        "attribute": quoteattr,
+        "json": json.dumps,
+        "fill": textwrap.fill,
+        "quotable": quotable,
+    }
+    environment.filters |= {"line": line_of, "quoted": quoted}
+    return environment
 
 
 def number(value: float) -> str:
-    """Return a number such that a compiler reads the very same double."""
+    """Return the text of a number that a C compiler reads as the same double."""
     text = "INFINITY" if math.isinf(value) else repr(float(value))
     return f"({text})" if text.startswith("-") else text
 
@@ -63,12 +69,12 @@ def comment(text: str) -> str:
 
 
 def line_of(text: str) -> str:
-    """Return a text on one line."""
+    """Return a text on one line, with a space for each unprintable character."""
     return "".join(item if item.isprintable() else " " for item in text)
 
 
 def quoted(text: str) -> str:
-    """Return a text as Modelica writes it."""
+    """Return a text as a string literal of Modelica."""
     escaped = line_of(text).replace("\\", "\\\\").replace('"', '\\"')
     return f'"{escaped}"'
 

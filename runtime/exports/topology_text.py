@@ -45,7 +45,7 @@ class CVariable:
     """A readable variable: its name as in `simulate`, unit, and the member of `model` that stores it.
 
     Its `role` is "input" or "flag" (0 or 1) for external values, equal to `start` until set; "state" or
-    "parameter" for values that are `start` at time 0 unless set before; "output".
+    "parameter" for values equal to `start` at time 0 unless set before; else "output".
     """
 
     name: str
@@ -56,18 +56,18 @@ class CVariable:
 
     @property
     def given(self) -> bool:
-        """Whether it comes from outside."""
+        """Whether the value is set from outside."""
         return self.role in ("input", "flag")
 
 
 @dataclass(frozen=True, slots=True)
 class CLink:
-    """A link of the model, called `name` in C: its period, phase and the channels of its packets.
+    """A link of the model with its C name `name`, its period, its phase and the channels of its packets.
 
     `ring` packets of each peer are stored; `start` (peers, channels) are the values used before the first
-    arrives. `arcs` are (sender, receiver), grouped by receiver in order of reception; `delays` are theirs, in
-    s. `arrival_process` is None for a reliable link; otherwise `key` is its random-stream key, and up to
-    `stored` packets per pair are stored.
+    packet arrives. `arcs` are (sender, receiver), grouped by receiver in order of reception; `delays` are the
+    delays of these, in s. `arrival_process` is None for a reliable link; otherwise `key` is its random-stream
+    key, and up to `stored` packets per pair are stored.
     """
 
     link: str
@@ -86,7 +86,9 @@ class CLink:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CTopology:
-    """A model in C. Each of `peers` is its index in `codes` and its index among the peers of that code.
+    """A model in C.
+
+    `peers` are, for each peer, the index of its code in `codes` and its index within that code.
 
     Without `links` received values are external inputs.
     """
@@ -100,7 +102,7 @@ class CTopology:
 
 
 def single_peer(plan: SimulationPlan, number: int, method: Method) -> CTopology:
-    """Return one peer with its device and external packets. Raises ApcError as `peer_of`."""
+    """Return one peer in C, with its device and external packets as inputs. Raises ApcError as `peer_of`."""
     peer = peer_of(plan, number, method)
     variables = []
     for line in peer.lines:
@@ -118,47 +120,50 @@ def single_peer(plan: SimulationPlan, number: int, method: Method) -> CTopology:
         for line in peer.sending
         for entry in line.packet
     ]
-    variables += _inputs_of(peer, "peer0[0]", "")
+    variables += _variables_of(peer, "peer0[0]", "")
     variables.sort(key=lambda variable: not variable.given)
     return CTopology(peer.identifier, peer.schedule.quantum, (peer,), ((0, 0),), (), tuple(variables))
 
 
-def _inputs_of(peer: ExportedPeer, member: str, prefix: str) -> list[CVariable]:
-    """Return the readable variables of a peer that is a member of `model`."""
+def _variables_of(peer: ExportedPeer, member: str, prefix: str) -> list[CVariable]:
+    """Return the variables of a peer: signals, settable parameters and external forces."""
     variables = []
     for signal in peer.signals:
-        began = ("state", peer.start[signal.index[0]]) if signal.role == "state" else ()
-        local = f"{member}.{memory(peer, signal)}"
+        role_and_start = ("state", peer.start[signal.index[0]]) if signal.role == "state" else ()
+        c_member = f"{member}.{memory(peer, signal)}"
         if not signal.name.startswith(FORCE_ON):
-            variables.append(CVariable(prefix + signal.name, signal.unit, local, *began))
+            variables.append(CVariable(prefix + signal.name, signal.unit, c_member, *role_and_start))
     units = parameter_units(peer)
     for k, index in enumerate(peer.settable):
-        name, start, local = (
+        name, start, c_member = (
             peer.peer_type.parameters[index],
             float(peer.parameters[index]),
             f"{member}.p[{k}]",
         )
         if name.startswith(FORCE_ON):
             name = f"{FORCE_ON}{prefix}{name.removeprefix(FORCE_ON)}"
-            variables.append(CVariable(name, "N", local, "input", start))
+            variables.append(CVariable(name, "N", c_member, "input", start))
         else:
-            variables.append(CVariable(prefix + name, units[name], local, "parameter", start))
+            variables.append(CVariable(prefix + name, units[name], c_member, "parameter", start))
     return variables
 
 
 def c_topology(plan: SimulationPlan, method: Method) -> CTopology:
-    """Return an entire model in C.
+    """Return a complete model in C.
 
     Raises
     ------
     ApcError
-        E960 it has too many directed peer pairs for a text; and as `peer_of`, `arrival_process_of`.
+        E960 too many directed peer pairs; and as `peer_of`, `arrival_process_of`.
     """
     system, exchange = plan.system, plan.exchange
     total = exchange.peers * (exchange.peers - 1) if any(map(exchange.is_complete, exchange.links)) else 0
     if max(total, exchange.peers) > MOST_ARCS:
-        message = f"{exchange.peers:,} peers hear each other on {total:,} ways; {MOST_ARCS:,} fit a text of C"
-        alone = f'--peer "{exchange.peer_name(0)}"' if exchange.peers <= MOST_RECEIVED else "fewer peers"
+        message = (
+            f"{exchange.peers:,} peers have {total:,} directed connections; the limit of the C export "
+            f"is {MOST_ARCS:,}"
+        )
+        alone = f'--peer "{exchange.peer_name(0)}"' if exchange.peers <= MOST_RECEIVED else ""
         raise refused(system, message, alone)
     first = subsystems_of(plan)
     subsystems = [*dict.fromkeys(first)]
@@ -167,16 +172,18 @@ def c_topology(plan: SimulationPlan, method: Method) -> CTopology:
     codes = tuple(
         peer_of(plan, subsystem, method, name=name) for subsystem, name in zip(subsystems, names, strict=True)
     )
-    placed: Counter[int] = Counter()
+    counts: Counter[int] = Counter()
     peers = []
     for number in map(subsystems.index, first):
-        peers.append((number, placed[number]))
-        placed[number] += 1
+        peers.append((number, counts[number]))
+        counts[number] += 1
     quantum = codes[0].schedule.quantum
     variables = [
         variable
         for k, (subsystem, index) in enumerate(peers)
-        for variable in _inputs_of(codes[subsystem], f"peer{subsystem}[{index}]", f"{exchange.peer_name(k)}.")
+        for variable in _variables_of(
+            codes[subsystem], f"peer{subsystem}[{index}]", f"{exchange.peer_name(k)}."
+        )
     ]
     variables.sort(key=lambda variable: not variable.given)
     links = _links(plan, quantum)
@@ -184,7 +191,7 @@ def c_topology(plan: SimulationPlan, method: Method) -> CTopology:
 
 
 def _links(plan: SimulationPlan, quantum: Fraction) -> tuple[CLink, ...]:
-    """Return the links of a model; times count in quanta, in s."""
+    """Return the links of a model in C, with times in quanta and delays in seconds."""
     exchange, timings = plan.exchange, plan.numbers.timings
     used: dict[str, dict[str, None]] = {}
     arcs: dict[str, list[tuple[int, int]]] = {}
@@ -232,11 +239,11 @@ def _links(plan: SimulationPlan, quantum: Fraction) -> tuple[CLink, ...]:
 def shared(topology: CTopology) -> dict[str, Any]:
     """Return the data of the template `topology.c`, which executes a model together with the peers' texts.
 
-    It has `static void begin(model *m)` and `static void run(model *m, long long until)`, which executes up
-    to and including the sends of an instant.
+    The template has `static void begin(model *m)` and `static void run(model *m, long long until)`, which
+    executes up to and including the sends of an instant.
 
-    For each subsystem the data are its code, its peers' indices, and its links, each with its line and the
-    channel index of each packet entry.
+    For each subsystem the data are its code, its peers' indices, and its links, each with its `PeerLink` and
+    the channel index of each packet entry.
     """
     subsystems = []
     for s, code in enumerate(topology.codes):

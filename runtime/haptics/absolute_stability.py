@@ -1,11 +1,11 @@
 """Absolute stability: stability with every passive hand at every device.
 
-Takes: a `Model`.
+Takes: a `NumericModel`.
 Gives: `AbsoluteStability`, `PassiveMode`, `absolute_stability`; `passivity_radius`, `loop_growths`;
-`circulates`, `frequency_of`.
-Guarantees: no grid of frequencies decides anything; a verdict is proved, or it is undecided. A hand is any
-passive operator, separately at each device, or, where devices interact reciprocally, a joint one too.
-Does not: construct a hand that destabilizes; it names the mode from which energy can be extracted.
+`is_nonreciprocal`, `frequency_of`.
+Guarantees: verdicts do not depend on a grid of frequencies; a verdict is proved, or undecided. A hand is any
+passive operator, separate at each device or, for devices with reciprocal interaction, also a joint one.
+Does not: construct a destabilizing hand; the mode from which energy can be extracted is named.
 """
 
 from __future__ import annotations
@@ -21,15 +21,13 @@ from numpy.typing import NDArray
 from apc.analysis.analysis import Analysis, analyze, lifted_groups, near_start
 from apc.analysis.contact_modes import contact_modes
 from apc.analysis.nonlinear_elements import is_linear
-from apc.analysis.one_sided_slopes import Side, severity, sides
-from apc.compiler.compiled import Model
+from apc.analysis.one_sided_slopes import severity, sides
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.timings import part
-from apc.eigen.kyp_bounds import least_real, proves_positive
-from apc.eigen.modes import split
-from apc.frame.devices import clamped, directions_of, replaced_hands, without_hands
-from apc.frame.evaluation_errors import finite_equations
-from apc.frame.interval_arithmetic import (
+from apc.haptics.displacement_port import PortLoop, port_loops
+from apc.haptics.published_limits import published_limits
+from apc.lifting.devices import clamped, directions_of, replaced_hands, without_hands
+from apc.lifting.interval_arithmetic import (
     MIDPOINT_RADIUS,
     UNIT_ROUNDOFF,
     error_radius,
@@ -37,14 +35,15 @@ from apc.frame.interval_arithmetic import (
     value_of,
     with_error_radius,
 )
-from apc.frame.numeric_model import Prepared, prepare
-from apc.haptics.displacement_port import PortLoop, port_loops
-from apc.haptics.published_limits import published_limits
+from apc.lifting.numeric_model import NumericModel, numeric_model
+from apc.linearization.evaluation_errors import finite_equations
 from apc.mean_square.mean_square_stability import StabilityMeasure
 from apc.network.nominal_criterion import limitations
-from apc.not_supported import NotSupportedError
 from apc.result import Result
-from apc.threads import load_pool, single_threaded
+from apc.spectrum.kyp_bounds import least_real, proves_positive
+from apc.spectrum.modes import split
+from apc.support.not_supported import NotSupportedError
+from apc.support.threads import load_pool, single_threaded
 from apc.verdict import NO_PROOF, ProofMethod, ProofScope, StabilityProof, Term
 
 Complexes = NDArray[np.complex128]
@@ -52,39 +51,39 @@ Complexes = NDArray[np.complex128]
 OPTION = "--hands passive"
 
 CIRCULATES = (
-    "What devices feel of one another at rest is not what springs give: moved slowly round, they give back "
-    "more energy than they got, whatever their damping"
+    "The static forces between devices are not conservative: in a slow closed cycle they generate energy "
+    "at any damping"
 )
 
 # The relative margins of a proof below the computed minimum, tried in order; and the fraction of the margin
 # that a proof leaves for rounding.
 WIDTHS, SPARED = (1e-9, 3e-9, 1e-8, 1e-7, 1e-5), (1e-2, 1e-3)
 
-# Widths that a verdict requires at first: more digits than are shown, at a third of the time.
+# The first margins for a verdict: more digits than are shown, in a third of the time.
 SHOWN = (1e-7, 1e-5)
 
-# The relative difference within which two frequencies are one.
+# The relative difference of equal fits of two frequencies.
 SIMILAR = 1e-6
 
 
 class PassivityVerdict(Term):
-    """The verdict with all passive hands; `NEVER` where no damping makes it stable."""
+    """The verdict over all passive hands; `NEVER`: unstable with any damping."""
 
     STABLE = "stable with any passive hands"
     UNSTABLE = "unstable with some passive hands"
     UNDECIDED = "undecided"
-    NEVER = "unstable with some passive hands, however much damping there is"
+    NEVER = "unstable with some passive hands at any damping"
 
 
 @dataclass(frozen=True, slots=True)
 class PassiveMode:
-    """A mode of devices with hands: the common mode, or a difference mode.
+    """A mode with hands at its devices: the common mode, or a difference mode.
 
-    `damping` is that of its devices in N·s/m, None where they differ; `more` is the additional damping that
-    each requires, negative for a reserve, ± `error`; None where none suffices, as the model is unstable with
+    `damping` is that of its devices in N·s/m, None if they differ; `more` ± `error` is the additional damping
+    that each device requires, negative for a reserve; None if no damping suffices: the model is unstable with
     its devices clamped, or the static forces at devices are not those of springs. `frequency_hz` is the
-    frequency of the largest extractable energy. `stiffness` is the static stiffness at its devices, N/m, None
-    where it spans several groups.
+    frequency of the largest extractable energy. `stiffness` is the static stiffness at its devices in N/m,
+    None if the mode spans several groups.
     """
 
     name: str
@@ -98,17 +97,17 @@ class PassiveMode:
 
     @property
     def needed(self) -> float | None:
-        """The smallest sufficient damping of each device, N·s/m."""
+        """The smallest sufficient damping of each device in N·s/m, None if unknown."""
         return None if self.damping is None or self.more is None else self.damping + self.more
 
 
 @dataclass(frozen=True, slots=True)
 class AbsoluteStability(Result):
-    """Whether a model is stable with every passive hand at its devices.
+    """The result of the test of a model with every passive hand at its devices.
 
     `clamped_radius` ± `clamped_error` is the spectral radius with all devices clamped, the stiffest hand.
-    `joined` states that the result holds for joint passive hands, too; without reciprocity it holds for
-    separate hands. `why` is the reason why no damping suffices, where that follows from the equations alone.
+    `joined` states that the result also holds for joint passive hands; without reciprocity it holds for
+    separate hands. `why` is the reason if no damping suffices, as a consequence of the equations.
     """
 
     shown_by = "haptics_output:passive"
@@ -128,12 +127,12 @@ class AbsoluteStability(Result):
 
     @property
     def worst_mode(self) -> PassiveMode | None:
-        """The mode that requires most damping."""
+        """The mode that requires the most damping, None without modes."""
         passive_modes = [mode for mode in self.modes if mode.more is not None]
-        lost = [mode for mode in self.modes if mode.more is None]
+        insufficient = [mode for mode in self.modes if mode.more is None]
         return (
-            lost[0]
-            if lost
+            insufficient[0]
+            if insufficient
             else max(passive_modes, key=lambda passive_mode: passive_mode.more or 0.0)
             if passive_modes
             else None
@@ -141,90 +140,84 @@ class AbsoluteStability(Result):
 
 
 @part("passive hands")
-def absolute_stability(
-    system: Model, prepared: Prepared | None = None, *, certify: bool = False
-) -> AbsoluteStability:
-    """Return whether a model is stable with every passive hand at every device.
+def absolute_stability(numeric: NumericModel, *, certify: bool = False) -> AbsoluteStability:
+    """Return the verdict on a model's stability with every passive hand at every device.
 
     Parameters
     ----------
-    system
-        The compiled model, with the parameter values to analyse.
-    prepared
-        From `numeric_model.prepare`, of this model with any values.
+    numeric
+        The model with its parameter values.
     certify
-        Whether the result for clamped devices is proved in ball arithmetic, where it decides.
+        Whether the result for clamped devices is proved in ball arithmetic, if the verdict depends on it.
 
     Raises
     ------
     ApcError
         E931 a peer without a device; E932 hands in the topology; E933 a device that is affected by other
-        signals than samples and held forces, or too many intervals; and those of `analysis.analyze`.
+        signals than samples and held forces, or too many intervals; and the errors of `analysis.analyze`.
 
     Notes
     -----
     After Colgate and Schenkel, J. Robotic Systems 14 (1997) 37, for any number of devices, delays and clocks:
     see `displacement_port`.
     """
-    of_topology, system = system, without_hands(system, OPTION)
-    if prepared is None or system is not of_topology:
-        prepared = prepare(system)
-    if along := _directions(system, prepared):
-        parts = {
-            axis: absolute_stability(compiled_system, certify=certify)
-            for axis, compiled_system in along.items()
-        }
-        return _together(parts, replaced_hands(of_topology))
-    fixed = analyze(clamped(system, option=OPTION), certify=certify)
-    each = [
-        _one_sided_hand_conditions(side.system, side.prepared, fixed, certify=certify)
-        for side in sides(system, prepared)
+    results = {
+        axis: _stability_along_line(part, certify=certify)
+        for axis, part in _models_by_direction(numeric).items()
+    }
+    return _combined_directions(results, replaced_hands(numeric.model))
+
+
+def _stability_along_line(numeric: NumericModel, *, certify: bool) -> AbsoluteStability:
+    """Return the verdict of a model without hands whose devices move along a line."""
+    clamped_analysis = analyze(numeric_model(clamped(numeric.model, option=OPTION)), certify=certify)
+    results = [
+        _one_sided_hand_conditions(side.numeric, clamped_analysis, certify=certify) for side in sides(numeric)
     ]
-    worst = max(each, key=lambda hands: severity(hands.stable, _missing(hands)))
-    return replace(worst, limitations=(*replaced_hands(of_topology), *_limitations(system, prepared)))
+    worst = max(results, key=lambda hands: severity(hands.stable, _missing_damping(hands)))
+    return replace(worst, limitations=_limitations(numeric))
 
 
-def _missing(hands: AbsoluteStability) -> float:
-    """Return the additional damping that the worst mode requires."""
+def _missing_damping(hands: AbsoluteStability) -> float:
+    """Return the additional damping in N·s/m that the worst mode requires, infinite if none suffices."""
     worst = hands.worst_mode
     return -math.inf if worst is None else math.inf if worst.more is None else worst.more
 
 
-def _limitations(system: Model, prepared: Prepared) -> tuple[str, ...]:
-    linear = all(prepared.jacobians[group.peer_type].affine for group in system.groups)
+def _limitations(numeric: NumericModel) -> tuple[str, ...]:
+    """Return the limitations of a result with passive hands."""
     return (
-        *near_start(system, prepared),
-        *published_limits(system),
-        *limitations(system),
-        *_as_at_start(system, prepared, linear=linear),
+        *near_start(numeric),
+        *published_limits(numeric.model),
+        *limitations(numeric.model),
+        *_contact_note(numeric, linear=numeric.affine),
     )
 
 
 def _one_sided_hand_conditions(
-    system: Model,
-    prepared: Prepared,
+    numeric: NumericModel,
     fixed: Analysis,
     *,
     certify: bool,
 ) -> AbsoluteStability:
-    """Return the verdict of a topology without kinks, in which devices move along a line.
+    """Return the verdict of a model without kinks whose devices move along a line.
 
     `fixed` is the analysis with its devices clamped.
     """
-    with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
+    with single_threaded(), finite_equations(numeric.model.origin.topology), np.errstate(all="ignore"):
         loops: tuple[PortLoop, ...] = ()
-        unserved = ""
+        unsupported = ""
         try:
-            loops = port_loops(system, prepared, option=OPTION)
+            loops = port_loops(numeric, option=OPTION)
         except NotSupportedError as why:
-            unserved = str(why)
-        modes = tuple(_verdict_of(loop) for loop in loops)
-        never = unserved or (CIRCULATES if any(map(circulates, loops)) else "")
-    linear = is_linear(system, prepared)
+            unsupported = str(why)
+        modes = tuple(_passive_mode(loop) for loop in loops)
+        never_reason = unsupported or (CIRCULATES if any(map(is_nonreciprocal, loops)) else "")
+    linear = is_linear(numeric)
     stable: bool | None = None
-    joined = not unserved and all(loop.joined for loop in loops)
-    input_slots = [mode.passive is False and (joined or mode.more is None) for mode in modes]
-    if unserved or fixed.stable is False or any(input_slots):
+    joined = not unsupported and all(loop.joined for loop in loops)
+    mode_fails = [mode.passive is False and (joined or mode.more is None) for mode in modes]
+    if unsupported or fixed.stable is False or any(mode_fails):
         stable = False
     elif all(mode.passive for mode in modes) and fixed.stable:
         stable = True
@@ -235,200 +228,204 @@ def _one_sided_hand_conditions(
     }[stable]
     bounded = StabilityProof(ProofMethod.ROUNDED, scope=(ProofScope.LINEARIZATION,) * (not linear))
     proof = NO_PROOF if stable is None else bounded
-    if certify and fixed.stable is False and not never:
+    if certify and fixed.stable is False and not never_reason:
         proof = fixed.proof or bounded
         proof = replace(proof, scope=(*proof.scope, ProofScope.CLAMPED_DEVICES))
     return AbsoluteStability(
-        topology=system.name,
-        verdict=PassivityVerdict.NEVER if never else verdict,
+        topology=numeric.model.name,
+        verdict=PassivityVerdict.NEVER if never_reason else verdict,
         stable=stable,
         clamped_stable=fixed.stable,
         clamped_radius=fixed.spectral_radius,
         clamped_error=fixed.spectral_radius_error,
         modes=modes,
         joined=joined,
-        why=never,
+        why=never_reason,
         proof=proof,
         linearized=not linear,
         limitations=(),
     )
 
 
-def _directions(system: Model, prepared: Prepared) -> dict[str, Model]:
-    """Return the model along each direction of its devices, empty where they move along a line.
+def _models_by_direction(numeric: NumericModel) -> dict[str, NumericModel]:
+    """Return the model without hands along each direction of its devices, "" if all move along a line.
 
     Raises
     ------
     ApcError
-        E933 a motion along one direction acts on one along another.
+        E933 motions along different directions are coupled.
     """
+    system = without_hands(numeric.model, OPTION)
+    numeric = numeric if system is numeric.model else numeric_model(system)
     along = directions_of(system)
-    side = sides(system, prepared)[0] if along else Side("", system, prepared)
-    for loop in split(*lifted_groups(side.system, prepared=side.prepared)) if along else ():
+    for loop in split(*lifted_groups(sides(numeric)[0].numeric)) if along else ():
         parts = load_pool("scipy.sparse.csgraph").connected_components(loop.matrix != 0, connection="weak")[1]
-        of: dict[str, set[str]] = {}
-        for name, part_ in zip(loop.layout.names, parts.tolist(), strict=True):
+        axes_of_part: dict[str, set[str]] = {}
+        for name, part_label in zip(loop.layout.names, parts.tolist(), strict=True):
             if (axis := f"x{name[name.rindex('[') :]}" if "[" in name else "") in along:
-                of.setdefault(str(part_), set()).add(axis)
-        if any(len(axes) > 1 for axes in of.values()):
-            message = f"{OPTION}: devices move along {', '.join(along)}, which act on one another"
+                axes_of_part.setdefault(str(part_label), set()).add(axis)
+        if any(len(axes) > 1 for axes in axes_of_part.values()):
+            message = f"{OPTION}: devices move along several coupled axes ({', '.join(along)})"
             raise ApcError(Diagnostic("E933", SourceLocation(system.origin.topology), message))
-    return along
+    return {axis: numeric_model(part) for axis, part in along.items()} or {"": numeric}
 
 
-def _together(parts: Mapping[str, AbsoluteStability], replaced: tuple[str, ...]) -> AbsoluteStability:
-    """Return the result of all directions together, which are uncoupled."""
-    verdicts = [part.stable for part in parts.values()]
+def _combined_directions(
+    results: Mapping[str, AbsoluteStability], replaced: tuple[str, ...]
+) -> AbsoluteStability:
+    """Return the common result of all directions, which are uncoupled."""
+    verdicts = [part.stable for part in results.values()]
     stable = False if False in verdicts else None if None in verdicts else True
-    deciding = next(part for part in parts.values() if part.stable is stable)
+    representative = next(part for part in results.values() if part.stable is stable)
     modes = tuple(
-        replace(mode, name=f"{mode.name}, {axis}") for axis, part in parts.items() for mode in part.modes
+        replace(mode, name=f"{mode.name}, {axis}" if axis else mode.name)
+        for axis, part in results.items()
+        for mode in part.modes
     )
-    joined = all(part.joined for part in parts.values())
-    return replace(deciding, modes=modes, joined=joined, limitations=(*replaced, *deciding.limitations))
+    joined = all(part.joined for part in results.values())
+    return replace(
+        representative, modes=modes, joined=joined, limitations=(*replaced, *representative.limitations)
+    )
 
 
-def _as_at_start(system: Model, prepared: Prepared, *, linear: bool) -> tuple[str, ...]:
+def _contact_note(numeric: NumericModel, *, linear: bool) -> tuple[str, ...]:
     """Return a note on contacts that are assumed constant, although hands may open and close them."""
     if linear:
         return ()
     try:
-        parts = contact_modes(system, prepared=prepared).parts
+        parts = contact_modes(numeric).parts
     except ApcError:  # too many to list: a note on linearization is given
         return ()
     if not parts:
         return ()
-    text = (
-        f"left out: {', '.join(parts)} as at the start, whether they touch then or not; hands may change that"
-    )
-    return (text,)
+    note = f"excluded: opening and closing of contacts ({', '.join(parts)}); their initial state is assumed"
+    return (note,)
 
 
-def passivity_radius(system: Model, prepared: Prepared, *, bounded: bool = True) -> StabilityMeasure:
-    """Return a measure below 1 for stability with every passive hand, and above it otherwise.
+def passivity_radius(numeric: NumericModel, *, bounded: bool = True) -> StabilityMeasure:
+    """Return a number below 1 for stability with every passive hand, and above 1 otherwise, with bounds.
 
-    With n the damping required at each device and b the largest present one, it is e^{2 (n − b)/(n + b)}. n
-    grows without end where the model becomes unstable with devices clamped, and as 1/n this is continuous
-    there; beyond it is e².
+    With n the damping required at each device and b the largest present damping, it is e^{2 (n − b)/(n + b)}.
+    n tends to infinity at the limit of stability with devices clamped; the number is continuous there, and e²
+    beyond.
 
     Parameters
     ----------
-    system, prepared
-        As for `absolute_stability`.
+    numeric
+        The model with its parameter values.
     bounded
-        Whether bounds are required.
+        Whether proved bounds are required.
     """
-    each = loop_growths(system, prepared, bounded=bounded)
-    radius, low, high = (max(getattr(growth, name) for growth in each) for name in ("radius", "low", "high"))
+    growths = loop_growths(numeric, bounded=bounded)
+    radius, low, high = (
+        max(getattr(growth, name) for growth in growths) for name in ("radius", "low", "high")
+    )
     return StabilityMeasure(radius, low, high, exact=True, proved=True)
 
 
-def loop_growths(system: Model, prepared: Prepared, *, bounded: bool = True) -> list[StabilityMeasure]:
-    """Return the same measure of each closed loop: the largest is that of the model.
+def loop_growths(numeric: NumericModel, *, bounded: bool = True) -> list[StabilityMeasure]:
+    """Return the number of `passivity_radius` for each closed loop: the largest is that of the model.
 
     Parameters
     ----------
-    system, prepared, bounded
+    numeric, bounded
         As for `passivity_radius`.
     """
-    of_topology, system = system, without_hands(system, OPTION)
-    prepared = prepared if system is of_topology else prepare(system)
-    if along := _directions(system, prepared):
-        parts = (
-            loop_growths(compiled_system, prepare(compiled_system), bounded=bounded)
-            for compiled_system in along.values()
-        )
-        return [growth for part in parts for growth in part]
-    with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
-        result, scale = [(-np.inf, -np.inf, -np.inf)], 1.0
+    models = _models_by_direction(numeric).values()
+    return [growth for part in models for growth in _growths_along_line(part, bounded=bounded)]
+
+
+def _growths_along_line(numeric: NumericModel, *, bounded: bool) -> list[StabilityMeasure]:
+    """Return the number of each closed loop of a model without hands whose devices move along a line."""
+    with single_threaded(), finite_equations(numeric.model.origin.topology), np.errstate(all="ignore"):
+        reserves, scale = [(-np.inf, -np.inf, -np.inf)], 1.0
         with suppress(NotSupportedError):
-            loops = [
-                loop
-                for side in sides(system, prepared)
-                for loop in port_loops(side.system, side.prepared, option=OPTION)
-            ]
-            result = [
-                _bounds(loop)[:3] if bounded else (-np.inf if circulates(loop) else _least(loop)[0],) * 3
+            loops = [loop for side in sides(numeric) for loop in port_loops(side.numeric, option=OPTION)]
+            reserves = [
+                _bounds(loop)[:3]
+                if bounded
+                else (-np.inf if is_nonreciprocal(loop) else _least_eigenvalue(loop)[0],) * 3
                 for loop in loops
             ]
             scale = max(float(damping) for loop in loops for damping in loop.dampings) or 1.0
-    worst = min(result)
+    worst = min(reserves)
     if (
         bounded
         and np.isneginf(worst[0])
-        and not np.isneginf(min(most for *_, most in result))
-        and analyze(clamped(system, option=OPTION)).stable is False
+        and not np.isneginf(min(upper for *_, upper in reserves))
+        and analyze(numeric_model(clamped(numeric.model, option=OPTION))).stable is False
     ):
-        result.append((-np.inf, -np.inf, -np.inf))  # floats alone decided
-    return [_passivity_radius(scale, *item) for item in result]
+        reserves.append((-np.inf, -np.inf, -np.inf))  # floats alone decided
+    return [_passivity_radius(scale, *bounds) for bounds in reserves]
 
 
-def _passivity_radius(scale: float, *spare: float) -> StabilityMeasure:
-    """Return e^{2 (n − b)/(n + b)}, with b the largest damping and bounds on the reserve b − n."""
-    needed = [scale - value for value in spare]
+def _passivity_radius(scale: float, *reserve: float) -> StabilityMeasure:
+    """Return e^{2 (n − b)/(n + b)} with bounds, from the largest damping b and bounds on the
+    reserve b − n.
+    """
+    needed = [scale - value for value in reserve]
     logs = [np.sign(value) if np.isinf(value) else (value - scale) / (abs(value) + scale) for value in needed]
     radius, high, low = (float(np.exp(2 * log)) for log in logs)
-    if spare[1] >= 0:  # passive, at the margin
+    if reserve[1] >= 0:  # passive, at the margin
         high = min(high, float(np.nextafter(1.0, 0.0)))
     return StabilityMeasure(radius, low, high, exact=True, proved=True)
 
 
-def _verdict_of(loop: PortLoop) -> PassiveMode:
-    """Return whether hands can extract energy from a mode."""
+def _passive_mode(loop: PortLoop) -> PassiveMode:
+    """Return the passivity of a mode: whether hands can extract energy, and the missing damping."""
     least, low, high, angle = _bounds(loop, SHOWN)
     if low < 0 <= high:
         least, low, high, angle = _bounds(loop)
     dampings = set(loop.dampings)
-    known = bool(np.isfinite(least))
+    is_finite = bool(np.isfinite(least))
     return PassiveMode(
         name=loop.name,
         multiplicity=loop.multiplicity,
         passive=True if low >= 0 else False if high < 0 else None,
         damping=float(dampings.pop()) if len(dampings) == 1 else None,
-        more=-least if known else None,
-        error=max(high - least, least - low) if known else None,
-        frequency_hz=frequency_of(loop, angle) if known else None,
+        more=-least if is_finite else None,
+        error=max(high - least, least - low) if is_finite else None,
+        frequency_hz=frequency_of(loop, angle) if is_finite else None,
         stiffness=float(loop.static[0, 0, 0]) if loop.static.shape[-1] == 1 else None,
     )
 
 
-def _bounds(loop: PortLoop, widths: Sequence[float] = WIDTHS) -> tuple[float, float, float, float]:
-    """Return the smallest eigenvalue of He H + diag(b/τ), proved bounds on it, and its angle.
+def _bounds(loop: PortLoop, margins: Sequence[float] = WIDTHS) -> tuple[float, float, float, float]:
+    """Return the smallest eigenvalue of He H + diag(b/τ) over all angles, proved bounds on it, and its angle.
 
-    The proved lower bound is the nearest of some relative widths that can be proved.
-
-    −∞ where the model is unstable with its devices clamped, which this does not prove, and where slow motions
-    extract energy, which it does.
+    The lower bound is below the eigenvalue by the smallest of some relative margins that can be proved. The
+    eigenvalue is −∞ for an unstable model with clamped devices (not proved), and if slow motions extract
+    energy (proved).
     """
-    if circulates(loop):
+    if is_nonreciprocal(loop):
         return -np.inf, -np.inf, -np.inf, 0.0
     matrices = loop.a, loop.b, loop.c, loop.d
-    least, angle = _least(loop)
+    least, angle = _least_eigenvalue(loop)
     if not np.isfinite(least):
         return least, -np.inf, np.inf, angle
     scale = max(abs(least), float(np.abs(value_of(loop.weight)).max()))
     low = -np.inf
-    for width in widths:
-        shift = least - width * scale
-        less = MIDPOINT_RADIUS.subtract(
+    for margin in margins:
+        shift = least - margin * scale
+        shifted_weight = MIDPOINT_RADIUS.subtract(
             loop.weight, MIDPOINT_RADIUS.exact(shift * np.eye(len(loop.weight[0])))
         )
-        if proves_positive(*matrices, less, spared=[share * width for share in SPARED]):
+        if proves_positive(*matrices, shifted_weight, spared=[share * margin for share in SPARED]):
             low = shift
             break
     else:
         if least > 0 and proves_positive(*matrices, loop.weight):
             low = 0.0
-    return least, low, _draws(loop, angle), angle
+    return least, low, _upper_bound(loop, angle), angle
 
 
-def _least(loop: PortLoop) -> tuple[float, float]:
+def _least_eigenvalue(loop: PortLoop) -> tuple[float, float]:
     """Return the smallest eigenvalue of He H + diag(b/τ) over all angles, and its angle, in floats."""
     return least_real(*map(value_of, (loop.a, loop.b, loop.c, loop.d, loop.weight)))
 
 
-def circulates(loop: PortLoop) -> bool:
-    """Return whether the static stiffness is not that of any spring.
+def is_nonreciprocal(loop: PortLoop) -> bool:
+    """Return whether the static stiffness is not that of springs: hands can extract energy by slow motions.
 
     Parameters
     ----------
@@ -441,19 +438,13 @@ def circulates(loop: PortLoop) -> bool:
     around a cycle extract energy. A residue that is zero up to rounding counts as zero.
     """
     value, error_bound = value_of(loop.static), error_radius(loop.static)
-    turned = np.abs(value - value.T) > error_bound + error_bound.T
+    is_asymmetric = np.abs(value - value.T) > error_bound + error_bound.T
     least = float(np.linalg.eigvalsh((value + value.T) / 2).min())
-    return bool(turned.any()) or least < -2 * float((error_bound + error_bound.T).sum())
+    return bool(is_asymmetric.any()) or least < -2 * float((error_bound + error_bound.T).sum())
 
 
-def _draws(loop: PortLoop, angle: float) -> float:
-    """Return an upper bound on the Hermitian part in the worst direction at an angle.
-
-    Notes
-    -----
-    The Rayleigh quotient of an estimated worst direction bounds the smallest eigenvalue. e^{jθ} is replaced
-    by a nearby point of the circle with rational coordinates.
-    """
+def _upper_bound(loop: PortLoop, angle: float) -> float:
+    """Return a proved upper bound on the smallest eigenvalue of He H + diag(b/τ) at an angle."""
     tangent = float(np.tan(angle / 2))
     z = complex(1 - tangent**2, 2 * tangent) / (1 + tangent**2)
     direction = _worst_mode(loop, z)[:, None]
@@ -466,24 +457,24 @@ def _draws(loop: PortLoop, angle: float) -> float:
     if states is None:
         return np.inf
     through = MIDPOINT_RADIUS.multiply(MIDPOINT_RADIUS.add(loop.d, loop.weight), v)
-    input_slots = MIDPOINT_RADIUS.multiply(
+    quadratic_form = MIDPOINT_RADIUS.multiply(
         MIDPOINT_RADIUS.exact(direction.conj().T),
         MIDPOINT_RADIUS.add(MIDPOINT_RADIUS.multiply(loop.c, states), through),
     )
     size = float(np.vdot(direction, direction).real)
-    top = float(input_slots[0, 0, 0].real + input_slots[1, 0, 0].real)
-    return top / size + 8 * UNIT_ROUNDOFF * abs(top)
+    numerator = float(quadratic_form[0, 0, 0].real + quadratic_form[1, 0, 0].real)
+    return numerator / size + 8 * UNIT_ROUNDOFF * abs(numerator)
 
 
 def _worst_mode(loop: PortLoop, z: complex) -> Complexes:
-    """Return the vector of the smallest eigenvalue of He H + diag(b/τ) at a point of the circle."""
+    """Return the eigenvector of the smallest eigenvalue of He H + diag(b/τ) at a point z of the circle."""
     a, b, c, d, weight = map(value_of, (loop.a, loop.b, loop.c, loop.d, loop.weight))
     response = c @ np.linalg.solve(z * np.eye(len(a)) - a, b + 0j) + d
     return np.asarray(np.linalg.eigh((response + response.conj().T) / 2 + weight)[1][:, 0])
 
 
 def frequency_of(loop: PortLoop, angle: float) -> float:
-    """Return the frequency of the motion of largest extractable energy at an angle, in Hz.
+    """Return the frequency in Hz of the motion with the largest extractable energy at an angle.
 
     Parameters
     ----------
@@ -494,18 +485,20 @@ def frequency_of(loop: PortLoop, angle: float) -> float:
 
     Notes
     -----
-    Frequencies that differ by a multiple of the frame rate have one angle: the motion within a frame selects
-    among them the dominant one.
+    Frequencies that differ by a multiple of the frame rate have the same angle: the motion within a frame
+    determines the dominant one.
     """
-    moved = _worst_mode(loop, complex(np.exp(1j * angle))) * np.sqrt(loop.seconds)
-    most = round(loop.frame_s / float(loop.seconds.min()) / 2) + 1
-    values = sorted(angle + 2 * np.pi * turn for turn in range(-most, most + 1))
-    values.sort(key=abs)  # of two with equal shares, the slower
+    displacements = _worst_mode(loop, complex(np.exp(1j * angle))) * np.sqrt(loop.seconds)
+    largest_multiple = round(loop.frame_s / float(loop.seconds.min()) / 2) + 1
+    values = sorted(
+        angle + 2 * np.pi * multiple for multiple in range(-largest_multiple, largest_multiple + 1)
+    )
+    values.sort(key=abs)  # of two equal fits, the lower frequency
     # A device moves at constant velocity in each interval: the share of each frequency, over all devices.
     middles, device = loop.starts + loop.seconds / 2, np.cumsum(loop.starts == 0) - 1
-    each = device == np.arange(device[-1] + 1)[:, None]
-    turned = np.outer(values, middles) / loop.frame_s
+    is_of_device = device == np.arange(device[-1] + 1)[:, None]
+    phases = np.outer(values, middles) / loop.frame_s
     shares = np.sinc(np.outer(values, loop.seconds) / (2 * np.pi * loop.frame_s))
-    fits = np.linalg.norm((np.exp(-1j * turned) * shares * moved) @ each.T, axis=1)
+    fits = np.linalg.norm((np.exp(-1j * phases) * shares * displacements) @ is_of_device.T, axis=1)
     best = next(value for value, fit in zip(values, fits, strict=True) if fit >= max(fits) * (1 - SIMILAR))
     return abs(best) / (2 * np.pi * loop.frame_s)

@@ -19,18 +19,18 @@ from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation, nearest
 from apc.compiler.language.vectors import whole_and_index
 from apc.compiler.wording import no_more
-from apc.frame.parameters import resolve
-from apc.option_value import option_value
+from apc.parameter_values.parameters import resolve
+from apc.support.option_value import option_value
 
 Floats = NDArray[np.float64]
 
-# The default of the highest frequency in Hz: hands sense higher ones, and act below it.
+# The default of the highest frequency in Hz: hand forces are below this frequency.
 HIGHEST = 60.0
 
 
 @dataclass(frozen=True, slots=True)
 class DevicePort:
-    """A device: its peer, counted from 0 over all groups, and the part, "" for the only one."""
+    """A device: the index of its peer, from 0 over all groups, and its part, "" for the only device."""
 
     peer: int
     part: str
@@ -47,12 +47,12 @@ def find_port(system: Model, text: str, option: str) -> DevicePort:
     system
         The compiled model.
     text, option
-        The name, and the option with it.
+        The name, and the command-line option for messages.
 
     Raises
     ------
     ApcError
-        E936 no such peer or part.
+        E936 an unknown peer or part.
     """
     counts = [group.count for group in system.groups]
     starts = np.cumsum([0, *counts]).tolist()
@@ -61,34 +61,34 @@ def find_port(system: Model, text: str, option: str) -> DevicePort:
     assert matched is not None
     group, number, local = matched["group"], matched["number"], matched["part"]
     if group is None:
-        first, _, rest = local.partition(".")
+        first, _, remainder = local.partition(".")
         if first in names:
-            group, number, local = first, "1", rest
+            group, number, local = first, "1", remainder
     states = [state.name for peer_type in system.peer_types for state in peer_type.states]
     parts = sorted({name.rpartition(".")[0] for name in states})
-    parts += sorted({name for name in states if whole_and_index(name)[1]})  # an axis of one
+    parts += sorted({name for name in states if whole_and_index(name)[1]})  # a single axis
     named = local if local in parts else "device" if "device" in parts else next(iter(parts), "device")
     example = f'{option} "{names[0]}[1].{named}"'
     if group is not None and group not in names:
-        message = f"{option}: no group of peers is called {group[:40]}"
-        hint = nearest(group, names)
-        hint = f'{option} "{hint}[{number}].{named}"' if hint else example
-        raise ApcError(Diagnostic("E936", SourceLocation(system.origin.topology), message, hint=hint))
+        message = f"{option}: unknown group of peers {group[:40]}"
+        fix = nearest(group, names)
+        fix = f'{option} "{fix}[{number}].{named}"' if fix else example
+        raise ApcError(Diagnostic("E936", SourceLocation(system.origin.topology), message, fix=fix))
     index = 0 if group is None else names.index(group)
     peer = int(number or 1)
     if not 1 <= peer <= counts[index]:
         example = f'{option} "{names[index]}[{counts[index]}].{named}"'
-        message = f"{option}: {names[index]} has {counts[index]:,} peers, counted from 1; there is no {peer}"
-        raise ApcError(Diagnostic("E936", SourceLocation(system.origin.topology), message, hint=example))
+        message = f"{option}: {names[index]} has peers 1 to {counts[index]:,}, got {peer}"
+        raise ApcError(Diagnostic("E936", SourceLocation(system.origin.topology), message, fix=example))
     if local and local not in parts:
-        message = f"{option}: nothing that moves is called {local[:40]}"
-        hint = f'{option} "{names[index]}[{peer}].{nearest(local, parts) or named}"'
-        raise ApcError(Diagnostic("E936", SourceLocation(system.origin.topology), message, hint=hint))
+        message = f"{option}: unknown moving part {local[:40]}"
+        fix = f'{option} "{names[index]}[{peer}].{nearest(local, parts) or named}"'
+        raise ApcError(Diagnostic("E936", SourceLocation(system.origin.topology), message, fix=fix))
     return DevicePort(starts[index] + peer - 1, local)
 
 
 def read_frequencies(system: Model, text: str | None, low: str, high: str | None, points: int) -> Floats:
-    """Return the frequencies of the options, in Hz: a list, or points between two limits at equal ratios.
+    """Return the frequencies of the options in Hz: a list, or points in equal ratios between two limits.
 
     Parameters
     ----------
@@ -102,7 +102,7 @@ def read_frequencies(system: Model, text: str | None, low: str, high: str | None
     Raises
     ------
     ApcError
-        E935 none above 0, the lowest above the highest, or no clock; those of `option_value`.
+        E935 no frequency above 0, an empty range, or no clock; the errors of `option_value`.
     """
     if text is not None:
         texts = [part.strip() for part in text.split(",") if part.strip()]
@@ -115,14 +115,14 @@ def read_frequencies(system: Model, text: str | None, low: str, high: str | None
     if high is not None:
         last = float(option_value("--to", high, subject="frequency", unit="Hz"))
     if not 0 < first < last:
-        message = f"from {first:.6g} Hz to {last:.6g} Hz there is nothing above 0 Hz"
+        message = f"no frequency above 0 Hz between {first:.6g} Hz and {last:.6g} Hz"
         if 0 < last <= first:
-            message = f"the span from {first:.6g} Hz to {last:.6g} Hz ends before it begins"
-        hint = '--from "0.1 Hz" --to "60 Hz"'
+            message = f"--from {first:.6g} Hz is above --to {last:.6g} Hz"
+        fix = '--from "0.1 Hz" --to "60 Hz"'
         if first > 0 and high is None:
-            message = f"{first:.6g} Hz is not below {last:.6g} Hz, where it ends without --to"
-            hint = f'--from "{first:.6g} Hz" --to "{_fastest(system) / 2:.6g} Hz"'
-        raise ApcError(Diagnostic("E935", SourceLocation("--from"), message, hint=hint))
+            message = f"{first:.6g} Hz is not below {last:.6g} Hz, the default of --to"
+            fix = f'--from "{first:.6g} Hz" --to "{_fastest(system) / 2:.6g} Hz"'
+        raise ApcError(Diagnostic("E935", SourceLocation("--from"), message, fix=fix))
     return np.geomspace(first, last, points)
 
 
@@ -139,33 +139,33 @@ def _fastest_clock(system: Model) -> tuple[Fraction, Fraction]:
     }
     clocks = [clock for clock in system.clocks if clock.name in used]
     if not clocks:
-        message = "the topology has nothing that ticks, and what is felt is told of samples and held forces"
-        hint = "a coupler with a clock, as SampledSpringDamper"
-        raise ApcError(Diagnostic("E935", SourceLocation(system.origin.topology), message, hint=hint))
+        message = "the topology has no clock; transparency is defined for sampled forces"
+        advice = "use a coupler with a clock, such as SampledSpringDamper"
+        raise ApcError(Diagnostic("E935", SourceLocation(system.origin.topology), message, advice=advice))
     clock = min(clocks, key=lambda clock: timings[clock.period])
     return timings[clock.period], timings[clock.phase]
 
 
 def next_peer(system: Model, port: DevicePort) -> int:
-    """Return the peer after one, itself if it is alone."""
+    """Return the index of the peer after a device's peer; of a single peer, its own."""
     return (port.peer + 1) % sum(group.count for group in system.groups)
 
 
 def check_frequencies(system: Model, values: Floats) -> None:
-    """Raise ApcError E935 for frequencies without a response."""
+    """Raise ApcError E935 for frequencies that are not positive, or beyond half the fastest clock rate."""
     most = _fastest(system) / 2
     location = SourceLocation(system.origin.topology)
-    hint = f"{no_more(most)} Hz at most"
+    advice = f"use at most {no_more(most)} Hz"
     if not values.size or not np.isfinite(values).all() or values.min() <= 0:
         got = "none" if not values.size else f"{values.min():.6g} Hz"
-        raise ApcError(Diagnostic("E935", location, "a frequency", "above 0 Hz", got, "0.1 Hz"))
+        raise ApcError(Diagnostic("E935", location, "frequency", "above 0 Hz", got, "0.1 Hz"))
     if values.max() > most:
-        message = f"{values.max():.6g} Hz is beyond half the fastest clock: samples take it for a slower one"
-        raise ApcError(Diagnostic("E935", location, message, hint=hint))
+        message = f"{values.max():.6g} Hz is above the Nyquist frequency of the fastest clock"
+        raise ApcError(Diagnostic("E935", location, message, advice=advice))
 
 
 def ticks_in(system: Model, frame: float) -> list[Fraction] | None:
-    """Return the ticks of the fastest clock in a frame, None where a frame does not begin with a tick."""
+    """Return the ticks of the fastest clock in a frame, in seconds; None if it does not tick at time 0."""
     period, phase = _fastest_clock(system)
     if phase % period:
         return None

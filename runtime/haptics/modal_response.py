@@ -26,12 +26,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.eigen.interconnection import ModalSystem, close_loop
-from apc.eigen.peer_classes import PeerClass
-from apc.frame.devices import Device
-from apc.frame.discretize import COEFFICIENT_ROUNDINGS, discretize, exponential
-from apc.frame.frame_inputs import FrameInputs, with_holds, with_ports
-from apc.frame.interval_arithmetic import (
+from apc.lifting.devices import Device
+from apc.lifting.discretize import COEFFICIENT_ROUNDINGS, discretize, exponential
+from apc.lifting.frame_inputs import FrameInputs, with_holds, with_ports
+from apc.lifting.interval_arithmetic import (
     MIDPOINT_RADIUS,
     UNIT_ROUNDOFF,
     rounded,
@@ -39,27 +37,29 @@ from apc.frame.interval_arithmetic import (
     value_of,
     with_error_radius,
 )
-from apc.frame.lift import check_packets, compose, step_durations, with_roundings
-from apc.frame.schedule import Propagate, Schedule
+from apc.lifting.lift import check_packets, compose, step_durations, with_roundings
+from apc.spectrum.interconnection import ModalSystem, close_loop
+from apc.spectrum.peer_classes import PeerClass
+from apc.timing.schedule import Propagate, Schedule
 
 Floats = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 Matrix = NDArray[Any]
 
-# Entries of the matrices that are solved together, each some hundred bytes of memory.
+# Limit of entries of matrices in one batch of solutions, each some hundred bytes of memory.
 TOGETHER = 2**18
 
-# A series is truncated where its terms, for the largest |s τ|, are less than this.
+# A series is truncated when its terms, for the largest |s τ|, are below this.
 SERIES = 1e-18
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DrivenPeer:
-    """A peer with force inputs: its device, its equations, and its intervals in a frame.
+    """A peer with a force input: its device, its equations, and its intervals in a frame.
 
-    `a`, `b` (2, n_x, …) are the continuous equations with their radii, `push` (2, n_x) the effect of a force
-    on the device; `seconds` and `starts` (r,) are the intervals; `ports` the indices in z of the increments
-    at their ends and, at their beginnings, of states and holds.
+    `a`, `b` (2, n_x, …) are the continuous equations with radii, `push` (2, n_x) the effect of a force on the
+    device; `seconds` and `starts` (r,) are the lengths and starts of the intervals; `ports` are the indices
+    in z of the increments at the ends of intervals, and of the states and holds read at their starts.
     """
 
     group: PeerClass
@@ -82,8 +82,9 @@ class DrivenMode:
     """A mode with force inputs: ξ⁺ = M ξ + K κ, outputs C ξ + D κ (2, …), with κ the increments.
 
     `forced_increments` and `reads` are the indices of each subsystem in κ and in the outputs, by interval: in
-    κ, the increments of its states as the interval ends, and of the samples of its device's position from its
-    beginning on (r, n_x + 1); in the outputs, its states and holds as the interval begins (r, n_x + n_u).
+    κ, the increments of its states at the end of the interval, and of the samples of its device's position
+    from the start of the interval (r, n_x + 1); in the outputs, its states and holds at the start of the
+    interval (r, n_x + n_u).
     """
 
     name: str
@@ -98,30 +99,33 @@ class DrivenMode:
 
 
 def driven_subsystem(group: PeerClass, device: Device | None) -> tuple[PeerClass, DrivenPeer]:
-    """Return a group with increments of its states as inputs and readings of its holds, by interval."""
+    """Return a class of peers with increments of its states as inputs, and readings of states and holds."""
     schedule = group.schedule
-    at, seconds = _intervals(schedule)
+    starts, seconds = _intervals(schedule)
     n_x, n_u = group.subsystem.b.shape
     subsystems, readings = [], []
     for linear_subsystem in (group.subsystem, group.exact):
         subsystems.append(
             with_holds(linear_subsystem, np.zeros((n_x, n_x + 1), dtype=linear_subsystem.b.dtype))
         )
-        if device is not None:  # the last input is added to the samples of its position
-            for tick, plain in zip(subsystems[-1].ticks, linear_subsystem.ticks, strict=True):
-                tick.u[:, -1] = plain.x[:, device.position]
-        observed = np.zeros((n_x + n_u, n_x + n_u + n_x + 1), dtype=linear_subsystem.b.dtype)
-        observed[:, : n_x + n_u] += np.eye(n_x + n_u, dtype=np.int64)
-        readings.append(observed)
-    (subsystem, exact), full, ports = with_ports(subsystems, schedule, n_x + 1, at, readings, at)
+        if device is not None:  # the last input is added to the samples of its device's position
+            for tick, original_tick in zip(subsystems[-1].ticks, linear_subsystem.ticks, strict=True):
+                tick.u[:, -1] = original_tick.x[:, device.position]
+        reading = np.zeros((n_x + n_u, n_x + n_u + n_x + 1), dtype=linear_subsystem.b.dtype)
+        reading[:, : n_x + n_u] += np.eye(n_x + n_u, dtype=np.int64)
+        readings.append(reading)
+    (subsystem, exact), full, ports = with_ports(subsystems, schedule, n_x + 1, starts, readings, starts)
     check_packets(full)
     durations = step_durations(full)
     steps = discretize(group.exact.a, group.exact.b, [duration * full.quantum for duration in durations])
-    # At the end of a step each of some additional holds adds its value to a state.
-    kick = MIDPOINT_RADIUS.exact(np.eye(n_x, n_x + 1))
-    kicked = [np.concatenate([step, kick], axis=-1) for step in steps]
+    # At the end of a step each additional hold adds its value to one state.
+    increment_columns = MIDPOINT_RADIUS.exact(np.eye(n_x, n_x + 1))
+    extended_steps = [np.concatenate([step, increment_columns], axis=-1) for step in steps]
     lifted = compose(
-        with_roundings(subsystem), full, dict(zip(durations, kicked, strict=True)), numbers=MIDPOINT_RADIUS
+        with_roundings(subsystem),
+        full,
+        dict(zip(durations, extended_steps, strict=True)),
+        numbers=MIDPOINT_RADIUS,
     )
     push = np.zeros((2, n_x))
     if device is not None:
@@ -135,139 +139,149 @@ def driven_subsystem(group: PeerClass, device: Device | None) -> tuple[PeerClass
         b=rounded(group.subsystem.b, COEFFICIENT_ROUNDINGS),
         push=push,
         seconds=tuple(second * schedule.quantum for second in seconds),
-        starts=tuple(number * schedule.quantum for number in at),
+        starts=tuple(number * schedule.quantum for number in starts),
         ports=ports,
     )
 
 
 def _intervals(schedule: Schedule) -> tuple[list[int], list[int]]:
-    """Return the start and length of each interval between events in a frame, in quanta."""
-    at, lasting, now = [], [], 0
+    """Return the starts and lengths of the intervals between events in a frame, in quanta."""
+    starts, lengths, now = [], [], 0
     for event in schedule.events:
         if isinstance(event, Propagate):
-            at.append(now)
-            lasting.append(event.duration)
+            starts.append(now)
+            lengths.append(event.duration)
             now += event.duration
-    return at, lasting
+    return starts, lengths
 
 
 def driven_mode(loop: ModalSystem, subsystems: Mapping[int, DrivenPeer]) -> DrivenMode:
-    """Return a closed loop of opened peers, with its inputs and readings taken out of the state.
+    """Return a closed loop of driven peers, its inputs and readings separated from the state.
 
     Parameters
     ----------
     loop, subsystems
-        Its groups are those of `driven_subsystem`, with subsystems identified by the schedule's id.
+        The loop of classes from `driven_subsystem`, and their driven peers by the schedule's id.
     """
     closed = close_loop(loop)
-    local = [subsystems[id(group.schedule)] for group in loop.subsystems]
-    whole = with_error_radius(closed.matrix, closed.error)
-    pairs = list(zip(closed.offsets, local, strict=True))
+    driven_peers = [subsystems[id(group.schedule)] for group in loop.subsystems]
+    closed_matrix = with_error_radius(closed.matrix, closed.error)
+    pairs = list(zip(closed.offsets, driven_peers, strict=True))
     added = [start + index for start, subsystem in pairs for index in subsystem.ports.added]
-    rest = np.delete(np.arange(len(closed.matrix)), added)
-    coupling_terms, numbered = [], []
-    for listed in (
+    remaining = np.delete(np.arange(len(closed.matrix)), added)
+    coupling_terms, positions = [], []
+    for index_arrays in (
         [start + subsystem.ports.input_slots for start, subsystem in pairs],
         [start + subsystem.ports.read for start, subsystem in pairs],
     ):
-        coupling_terms.append(np.concatenate([indices.ravel() for indices in listed]))
-        starts = np.cumsum([0, *(indices.size for indices in listed)])
-        numbered.append(
+        coupling_terms.append(np.concatenate([indices.ravel() for indices in index_arrays]))
+        starts = np.cumsum([0, *(indices.size for indices in index_arrays)])
+        positions.append(
             tuple(
                 np.arange(start, start + indices.size).reshape(indices.shape)
-                for start, indices in zip(starts, listed, strict=False)
+                for start, indices in zip(starts, index_arrays, strict=False)
             )
         )
-    into, out = coupling_terms
+    input_indices, output_indices = coupling_terms
     return DrivenMode(
         name=loop.name,
-        subsystems=tuple(local),
-        m=whole[:, rest[:, None], rest],
-        k=whole[:, rest[:, None], into],
-        c=whole[:, out[:, None], rest],
-        d=whole[:, out[:, None], into],
-        forced_increments=numbered[0],
-        reads=numbered[1],
-        frame=local[0].group.schedule.frame_s,
+        subsystems=tuple(driven_peers),
+        m=closed_matrix[:, remaining[:, None], remaining],
+        k=closed_matrix[:, remaining[:, None], input_indices],
+        c=closed_matrix[:, output_indices[:, None], remaining],
+        d=closed_matrix[:, output_indices[:, None], input_indices],
+        forced_increments=positions[0],
+        reads=positions[1],
+        frame=driven_peers[0].group.schedule.frame_s,
     )
 
 
 def spectra(
-    loop: DrivenMode, pushed: int, requested: Sequence[tuple[int, int, int]], s: Complex
+    loop: DrivenMode, pushed: int, outputs: Sequence[tuple[int, int, int]], s: Complex
 ) -> list[Matrix]:
     """Return the response of some states of a mode to a force e^{st} at all devices of one subsystem.
 
     Parameters
     ----------
     loop, pushed
-        The mode, and the subsystem that is driven with 1 N at each peer.
-    requested
+        The mode, and the index of the subsystem driven with 1 N at each peer.
+    outputs
         The subsystem and continuous state of each response, with the n of s + 2πjn/T.
     s
-        (k,), in 1/s.
+        The complex frequencies (k,) in 1/s.
 
     Returns
     -------
-    For each (k, 2, 1, 1), in SI units per newton, with its radius.
+    Each response (k, 2, 1, 1) in SI units per newton, with its radius.
     """
     forced_increments = np.zeros((len(s), 2, loop.k.shape[-1], 1), dtype=np.complex128)
     subsystem = loop.subsystems[pushed]
-    of_length = {seconds: _kick(subsystem, seconds, s) for seconds in set(subsystem.seconds)}
+    of_length = {seconds: _force_increments(subsystem, seconds, s) for seconds in set(subsystem.seconds)}
     for index, (seconds, start) in enumerate(zip(subsystem.seconds, subsystem.starts, strict=True)):
-        turned = MIDPOINT_RADIUS.multiply(of_length[seconds], _exponential(s, start))
-        forced_increments[:, :, loop.forced_increments[pushed][index, :-1]] = turned
-    state = _steady(loop.m, _exponential(s, loop.frame), MIDPOINT_RADIUS.multiply(loop.k, forced_increments))
+        delayed = MIDPOINT_RADIUS.multiply(of_length[seconds], _exponential(s, start))
+        forced_increments[:, :, loop.forced_increments[pushed][index, :-1]] = delayed
+    state = _solve_shifted(
+        loop.m, _exponential(s, loop.frame), MIDPOINT_RADIUS.multiply(loop.k, forced_increments)
+    )
     read = MIDPOINT_RADIUS.add(
         MIDPOINT_RADIUS.multiply(loop.c, state), MIDPOINT_RADIUS.multiply(loop.d, forced_increments)
     )
     result = {
-        (of, alias): _motion(loop, of, read, s, alias, pushed=of == pushed)
-        for of, alias in {(of, alias) for of, _, alias in requested}
+        (output_subsystem, alias): _motion(
+            loop, output_subsystem, read, s, alias, pushed=output_subsystem == pushed
+        )
+        for output_subsystem, alias in {(output_subsystem, alias) for output_subsystem, _, alias in outputs}
     }
-    return [result[of, alias][:, :, row, None] for of, row, alias in requested]
+    return [result[output_subsystem, alias][:, :, row, None] for output_subsystem, row, alias in outputs]
 
 
-def _motion(loop: DrivenMode, of: int, read: Matrix, s: Complex, alias: int, *, pushed: bool) -> Matrix:
-    """Return the continuous states (k, 2, n_x, 1) of a subsystem at s + 2πjn/T."""
-    subsystem, frame = loop.subsystems[of], float(loop.frame)
-    at = s + 2j * np.pi * alias / frame
-    gripped = read[:, :, loop.reads[of][:, len(subsystem.states) :].T, 0]  # (k, 2, holds, intervals)
-    of_length = {seconds: _lasting(at, float(seconds)) for seconds in set(subsystem.seconds)}
+def _motion(
+    loop: DrivenMode, output_subsystem: int, read: Matrix, s: Complex, alias: int, *, pushed: bool
+) -> Matrix:
+    """Return the continuous states (k, 2, n_x, 1) of a subsystem at s + 2πjn/T, n = `alias`."""
+    subsystem, frame = loop.subsystems[output_subsystem], float(loop.frame)
+    frequency = s + 2j * np.pi * alias / frame
+    hold_values = read[
+        :, :, loop.reads[output_subsystem][:, len(subsystem.states) :].T, 0
+    ]  # (k, 2, holds, intervals)
+    of_length = {
+        seconds: _exponential_integral(frequency, float(seconds)) for seconds in set(subsystem.seconds)
+    }
     weights = [
-        MIDPOINT_RADIUS.multiply(_exponential(-at, start), of_length[seconds])
+        MIDPOINT_RADIUS.multiply(_exponential(-frequency, start), of_length[seconds])
         for seconds, start in zip(subsystem.seconds, subsystem.starts, strict=True)
     ]
     share = with_error_radius(np.array([[1 / frame]]), np.array([[2 * UNIT_ROUNDOFF / frame]]))
     mean = MIDPOINT_RADIUS.multiply(
-        MIDPOINT_RADIUS.multiply(gripped, np.concatenate(weights, axis=-2)), share
+        MIDPOINT_RADIUS.multiply(hold_values, np.concatenate(weights, axis=-2)), share
     )
     driven = MIDPOINT_RADIUS.multiply(subsystem.b, mean)
     if pushed and alias == 0:
         driven = MIDPOINT_RADIUS.add(driven, subsystem.push[..., None])
-    return _steady(subsystem.a, _numbers(at, 4 * UNIT_ROUNDOFF * np.abs(at)), driven)
+    return _solve_shifted(subsystem.a, _with_bounds(frequency, 4 * UNIT_ROUNDOFF * np.abs(frequency)), driven)
 
 
-def _numbers(value: Matrix, error_bound: Floats) -> Matrix:
-    """Return numbers (k,) with their error bounds as matrices (k, 2, 1, 1)."""
+def _with_bounds(value: Matrix, error_bound: Floats) -> Matrix:
+    """Return numbers (k,) with their error bounds in the form (k, 2, 1, 1)."""
     return with_error_radius(value[:, None, None], error_bound[:, None, None])
 
 
 def _exponential(s: Complex, time: Fraction) -> Matrix:
-    """Return e^{st} (k, 2, 1, 1)."""
+    """Return e^{st} (k, 2, 1, 1) with its radius."""
     exact = float(time)
     value = np.exp(s * exact)
-    return _numbers(value, (3 * np.abs(s) * exact + 4) * UNIT_ROUNDOFF * np.abs(value))
+    return _with_bounds(value, (3 * np.abs(s) * exact + 4) * UNIT_ROUNDOFF * np.abs(value))
 
 
-def _lasting(s: Complex, seconds: float) -> Matrix:
-    """Return ∫ e^{−sσ} dσ over a duration in seconds (k, 2, 1, 1)."""
+def _exponential_integral(s: Complex, seconds: float) -> Matrix:
+    """Return ∫ e^{−sσ} dσ over a duration in seconds (k, 2, 1, 1), with its radius."""
     x = -s * seconds
     value = seconds * np.divide(np.expm1(x), x, out=np.ones_like(x), where=x != 0)
-    return _numbers(value, 16 * UNIT_ROUNDOFF * seconds * np.exp(np.maximum(x.real, 0.0)))
+    return _with_bounds(value, 16 * UNIT_ROUNDOFF * seconds * np.exp(np.maximum(x.real, 0.0)))
 
 
-def _kick(subsystem: DrivenPeer, seconds: Fraction, s: Complex) -> Matrix:
-    """Return γ(s) (k, 2, n_x, 1) of an interval, by its series in s."""
+def _force_increments(subsystem: DrivenPeer, seconds: Fraction, s: Complex) -> Matrix:
+    """Return γ(s) (k, 2, n_x, 1) of an interval, by its series in s, with its radius."""
     time = float(seconds)
     size = float(np.abs(s).max(initial=0.0)) * time
     terms, term = 1, 1.0
@@ -279,18 +293,18 @@ def _kick(subsystem: DrivenPeer, seconds: Fraction, s: Complex) -> Matrix:
     powers = ((s * time)[:, None] ** np.arange(terms))[..., None]
     uncertainty = (3 * np.arange(terms)[:, None] + 4) * UNIT_ROUNDOFF * np.abs(powers)
     values = MIDPOINT_RADIUS.multiply(input_columns, with_error_radius(powers, uncertainty))
-    left = (
+    truncation = (
         term
         * np.exp(size)
         * np.abs(value_of(input_columns)[:, 0])
         * (1 + np.abs(value_of(subsystem.a) * time).sum())
     )
-    values[:, 1, :, 0] += left
+    values[:, 1, :, 0] += truncation
     return values
 
 
 def force_columns(subsystem: DrivenPeer, seconds: float, count: int) -> Matrix:
-    """Return the effect of forces σ^i/i!, σ from 0 to 1 over an interval, on the states at its end.
+    """Return the effects of forces σ^i/i!, σ from 0 to 1 over an interval, on the states at its end.
 
     Parameters
     ----------
@@ -301,7 +315,7 @@ def force_columns(subsystem: DrivenPeer, seconds: float, count: int) -> Matrix:
 
     Returns
     -------
-    The exponential of all, with its radii (2, n_x + count, n_x + count).
+    The matrix exponential with its radii (2, n_x + count, n_x + count).
 
     Notes
     -----
@@ -315,16 +329,19 @@ def force_columns(subsystem: DrivenPeer, seconds: float, count: int) -> Matrix:
     return exponential(generator, np.zeros((2, n + count, 0)), 1.0, MIDPOINT_RADIUS)
 
 
-def _steady(matrix: Matrix, at: Matrix, driven: Matrix) -> Matrix:
+def _solve_shifted(matrix: Matrix, z: Matrix, driven: Matrix) -> Matrix:
     """Return x (k, 2, n, 1) of (z − M) x = driven, for z (k, 2, 1, 1) and M (2, n, n) with their radii."""
     n = matrix.shape[-1]
     values = None
-    if len(at) * n**2 <= TOGETHER or len(at) == 1:
-        values = solve(MIDPOINT_RADIUS.subtract(at * np.eye(n), matrix), driven)
-    if values is None and len(at) > 1:
-        half = len(at) // 2
+    if len(z) * n**2 <= TOGETHER or len(z) == 1:
+        values = solve(MIDPOINT_RADIUS.subtract(z * np.eye(n), matrix), driven)
+    if values is None and len(z) > 1:
+        half = len(z) // 2
         values = np.concatenate(
-            [_steady(matrix, at[local], driven[local]) for local in (slice(half), slice(half, None))]
+            [
+                _solve_shifted(matrix, z[half_slice], driven[half_slice])
+                for half_slice in (slice(half), slice(half, None))
+            ]
         )
     if values is None:  # z may be an eigenvalue, within the radii
         values = np.full(driven.shape, np.nan + 0j)

@@ -1,7 +1,7 @@
 """Frequency responses of peers to a force on one device, composed of the responses of modes.
 
-Takes: a `Model` with the result of `numeric_model.prepare` for it, and two devices.
-Gives: `Responses`, `responses`; `Weights`; `gripped_names`.
+Takes: a `NumericModel` and two devices.
+Gives: `Responses`, `responses`; `Weights`; `device_labels`.
 Guarantees: a response is exact for the sampled, held and sent signals of the model, with a bound on its
 rounding.
 Does not: check the stability of the model.
@@ -24,17 +24,17 @@ from apc.analysis.analysis import lifted_groups
 from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.language.vectors import whole_and_index
-from apc.eigen.interconnection import ModalSystem
-from apc.eigen.modes import decompose, dense_loop
-from apc.eigen.peer_classes import MOST_STATES, PeerClass
-from apc.eigen.rigid_modes import find_rigid_modes
-from apc.frame.communication_graph import CommunicationGraph
-from apc.frame.devices import LOCAL_MASS, Device, coupled_directly, find_device, find_devices
-from apc.frame.interval_arithmetic import MIDPOINT_RADIUS, UNIT_ROUNDOFF, with_error_radius
-from apc.frame.numeric_model import Prepared
-from apc.frame.parameters import resolve
 from apc.haptics.device_port import DevicePort
 from apc.haptics.modal_response import DrivenMode, driven_mode, driven_subsystem, spectra
+from apc.lifting.devices import LOCAL_MASS, Device, coupled_directly, find_device, find_devices
+from apc.lifting.interval_arithmetic import MIDPOINT_RADIUS, UNIT_ROUNDOFF, with_error_radius
+from apc.lifting.numeric_model import NumericModel
+from apc.spectrum.interconnection import ModalSystem
+from apc.spectrum.modes import decompose, dense_loop
+from apc.spectrum.peer_classes import PeerClass
+from apc.spectrum.rigid_modes import find_rigid_modes
+from apc.support.state_limits import MATRIX_STATES
+from apc.timing.communication_graph import CommunicationGraph
 
 Floats = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -43,8 +43,8 @@ Matrix = NDArray[Any]
 # Numbers (k,) with their error bounds.
 Carried = tuple[Complex, Floats]
 
-# The distance from an integer number of cycles per frame at which a model with rigid modes is evaluated on a
-# circle around the frequency; the radius of the circle in 1/s, and its number of points.
+# The distance from an integer number of cycles per frame below which a model with rigid modes is evaluated on
+# a circle around the frequency; the radius of the circle in 1/s, and its number of points.
 NEAR, ASIDE, AROUND = 1e-5, 0.25, 16
 
 # The limit of states and readings of all peer types together, in one matrix.
@@ -54,33 +54,34 @@ MOST_TOGETHER = 2000
 MOST_INCREMENTS = 4000
 
 
-def responses(system: Model, prepared: Prepared, port: DevicePort, other: DevicePort) -> Responses:
-    """Return the responses to a force on one device, at that device and at another.
+def responses(numeric: NumericModel, port: DevicePort, other: DevicePort) -> Responses:
+    """Return the frequency responses of two devices to a force on the first.
 
     Parameters
     ----------
-    system, prepared
-        The compiled model, and the result of `numeric_model.prepare` for it.
+    numeric
+        The model with its parameter values.
     port, other
-        The two devices.
+        The driven device and the other one.
 
     Raises
     ------
     ApcError
         E931 a peer without a device; E933 a model too large.
     """
-    groups, exchange = lifted_groups(system, prepared=prepared)
+    system = numeric.model
+    groups, exchange = lifted_groups(numeric)
     unit_of = {parameter.name: parameter.unit for parameter in system.parameters}
     direct = coupled_directly(system.peer_types)
-    opened, subsystems, gripped = [], {}, {}
+    driven_classes, subsystems, gripped = [], {}, {}
     for group in groups:
         device = None
-        for item in (other, port):
-            if item.peer not in group.peers:
+        for device_port in (other, port):
+            if device_port.peer not in group.peers:
                 continue
-            along = port.peer in group.peers or whole_and_index(port.part)[1]
-            named = item.part or (port.part if along else "")
-            gripped[item] = device = _gripped_device(system, prepared, group, named, unit_of)
+            has_axis = port.peer in group.peers or whole_and_index(port.part)[1]
+            part_name = device_port.part or (port.part if has_axis else "")
+            gripped[device_port] = device = _gripped_device(numeric, group, part_name, unit_of)
         if device is None:
             result = find_device(
                 group.jacobians, group.parameters, unit_of, group.initial_reception, direct=direct
@@ -88,106 +89,114 @@ def responses(system: Model, prepared: Prepared, port: DevicePort, other: Device
             device = result if isinstance(result, Device) else None
         _check_increments(system, group)
         peer_group, subsystem = driven_subsystem(group, device)
-        opened.append(peer_group)
+        driven_classes.append(peer_group)
         subsystems[id(peer_group.schedule)] = subsystem
-    plain, wide = _arranged(system, groups, exchange), _arranged(system, opened, exchange)
-    common = wide[0]
+    plain, driven_loops = (
+        _loops_by_class(system, groups, exchange),
+        _loops_by_class(system, driven_classes, exchange),
+    )
+    common = driven_loops[0]
     if (states := sum(len(subsystem.z_names) for subsystem in common.subsystems)) > MOST_TOGETHER:
-        message = (
-            f"{len(common.subsystems):,} peers that differ have {states:,} states and readings in a frame"
-        )
-        hint = f"fewer peers that differ: {MOST_TOGETHER:,} at most"
+        message = f"{len(common.subsystems):,} different peers have {states:,} states and samples in a frame"
+        advice = f"reduce the number of different peers (limit: {MOST_TOGETHER:,})"
         raise ApcError(
             Diagnostic(
-                "E933", SourceLocation(system.origin.topology), f"apc transparency: {message}", hint=hint
+                "E933", SourceLocation(system.origin.topology), f"apc transparency: {message}", advice=advice
             )
         )
-    here, there = (
-        next(index for index, subsystem in enumerate(common.subsystems) if item.peer in subsystem.peers)
-        for item in (port, other)
+    driven_index, other_index = (
+        next(
+            index for index, subsystem in enumerate(common.subsystems) if device_port.peer in subsystem.peers
+        )
+        for device_port in (port, other)
     )
-    name = common.subsystems[here].name
+    name = common.subsystems[driven_index].name
     difference_loops = [
-        number for number, loop in enumerate(wide) if number and loop.subsystems[0].name == name
+        number for number, loop in enumerate(driven_loops) if number and loop.subsystems[0].name == name
     ]
     return Responses(
         exchange=exchange,
         device=gripped[port],
         other=gripped[other],
-        loops=tuple(driven_mode(loop, subsystems) for loop in wide),
+        loops=tuple(driven_mode(loop, subsystems) for loop in driven_loops),
         plain=plain,
         members=tuple(subsystem.count for subsystem in common.subsystems),
-        local=here,
-        to=there,
+        local=driven_index,
+        to=other_index,
         unpaired=difference_loops[0] if difference_loops else None,
         same=port.peer == other.peer,
     )
 
 
-def _gripped_device(
-    system: Model, prepared: Prepared, group: PeerClass, part: str, unit_of: Mapping[str, str]
-) -> Device:
-    """Return the device of a group, the only one if no part is named, or raise an error."""
-    direct = coupled_directly(system.peer_types)
+def _gripped_device(numeric: NumericModel, group: PeerClass, part: str, unit_of: Mapping[str, str]) -> Device:
+    """Return the device of a class of peers, the only one if no part is named.
+
+    Without a device, an error E931 is raised.
+    """
+    direct = coupled_directly(numeric.model.peer_types)
     device = find_device(
         group.jacobians, group.parameters, unit_of, group.initial_reception, part=part, direct=direct
     )
     if isinstance(device, Device):
         return device
     message = device or f"{group.name} has no device"
-    names = gripped_names(system, prepared)
+    names = device_labels(numeric)
     local = [name for name in names if name.startswith(f"{group.name}[")]
-    hint = f'--at "{(local or names)[0]}"' if names else "" if device else LOCAL_MASS
-    raise ApcError(Diagnostic("E931", SourceLocation(system.origin.topology), message, hint=hint))
+    fix = f'--at "{(local or names)[0]}"' if names else "" if device else LOCAL_MASS
+    raise ApcError(Diagnostic("E931", SourceLocation(numeric.model.origin.topology), message, fix=fix))
 
 
-def gripped_names(system: Model, prepared: Prepared) -> list[str]:
-    """Return the labels of the possible devices, for the first peer of each group: `left[1].device`."""
-    unit_of, numbers = {parameter.name: parameter.unit for parameter in system.parameters}, resolve(system)
+def device_labels(numeric: NumericModel) -> list[str]:
+    """Return the labels of all parts that can be a haptic device, for the first peer of each group.
+
+    Such as `left[1].device`.
+    """
+    system = numeric.model
+    unit_of, numbers = {parameter.name: parameter.unit for parameter in system.parameters}, numeric.numbers
     direct = coupled_directly(system.peer_types)
     return [
         f"{group.name}[1].{part}"
         for index, group in enumerate(system.groups)
         for part, result in find_devices(
-            prepared.jacobians[group.peer_type], numbers.parameters[index][0], unit_of, direct=direct
+            numeric.jacobians[group.peer_type], numbers.parameters[index][0], unit_of, direct=direct
         ).items()
         if isinstance(result, Device)
     ]
 
 
 def _check_increments(system: Model, group: PeerClass) -> None:
-    """Raise ApcError E933 for a peer of too many events and states in a frame."""
+    """Raise ApcError E933 for a peer with too many events and states in a frame."""
     forced_increments = len(group.schedule.events) * len(group.subsystem.a)
     if forced_increments > MOST_INCREMENTS:
-        message = f"a frame of {group.name} has too many events and states: {forced_increments:,} together"
-        hint = f"{MOST_INCREMENTS:,} at most"
-        raise ApcError(Diagnostic("E933", SourceLocation(system.origin.topology), message, hint=hint))
+        message = f"a frame of {group.name} has {forced_increments:,} events and states"
+        advice = f"use at most {MOST_INCREMENTS:,} events and states"
+        raise ApcError(Diagnostic("E933", SourceLocation(system.origin.topology), message, advice=advice))
 
 
-def _arranged(
+def _loops_by_class(
     system: Model, groups: Sequence[PeerClass], exchange: CommunicationGraph
 ) -> tuple[ModalSystem, ...]:
-    """Return one loop of all classes of equal peers, and one difference loop each; or one of all."""
+    """Return one loop of all classes of equal peers and a difference loop for each, or one loop of
+    all peers.
+    """
     decomposed = decompose(groups, exchange)
-    first, *difference_loops = decomposed.loops
-    if decomposed.method == "modes" and _by_classes(first, difference_loops):
-        return first, *difference_loops
+    common, *difference_loops = decomposed.loops
+    if decomposed.method == "modes" and _are_difference_loops(common, difference_loops):
+        return common, *difference_loops
     states = sum(group.count * len(group.z_names) for group in groups)
-    if states > MOST_STATES:
-        message = (
-            f"{exchange.peers:,} peers on such a graph make one system of {states:,} states and readings"
-        )
-        hint = f"peers on complete graphs, or {MOST_STATES:,} in all"
+    if states > MATRIX_STATES:
+        message = f"{exchange.peers:,} peers on this graph form one system of {states:,} states and samples"
+        advice = f"use complete graphs, or at most {MATRIX_STATES:,} states in total"
         raise ApcError(
             Diagnostic(
-                "E933", SourceLocation(system.origin.topology), f"apc transparency: {message}", hint=hint
+                "E933", SourceLocation(system.origin.topology), f"apc transparency: {message}", advice=advice
             )
         )
     return (dense_loop(groups, exchange),)
 
 
-def _by_classes(common: ModalSystem, difference_loops: Sequence[ModalSystem]) -> bool:
-    """Return whether the other loops are one difference loop per class; a ring has others."""
+def _are_difference_loops(common: ModalSystem, difference_loops: Sequence[ModalSystem]) -> bool:
+    """Return whether the other loops are one difference loop per class; a ring has other modes."""
     many = {subsystem.name: subsystem.count - 1 for subsystem in common.subsystems}
     return all(
         len(loop.subsystems) == 1 and loop.multiplicity == many.get(loop.subsystems[0].name)
@@ -195,19 +204,20 @@ def _by_classes(common: ModalSystem, difference_loops: Sequence[ModalSystem]) ->
     )
 
 
-# A quantity of a peer over (subsystem, state): of class means, and of its difference from the mean of its
-# class.
+# The weights of an output over (subsystem, state): in the loop of class means, and in a peer's difference
+# loop.
 Weights = tuple[Mapping[tuple[int, int], float], Mapping[tuple[int, int], float]]
 
 
 @dataclass(frozen=True, eq=False)
 class Responses:
-    """The responses to a force on one peer's `device`: its own, and that of the `other` device.
+    """The frequency responses to a force on one peer's `device`: at this device, and at the `other` device.
 
-    They are sums over the responses of modes: `loops`, that of all classes first, then the difference loop of
-    each class; `plain` are the same of the model without inputs. A class is a subsystem of the first loop,
-    and represents `members` peers; `local` is that of the driven peer, `unpaired` its difference mode, if
-    there is one, `to` that of the other, `same` whether both are one peer. `exchange` are the links.
+    They are sums over the responses of modes: `loops` are the loop of all classes, then the difference loop
+    of each class; `plain` are the same loops without inputs. A class is a subsystem of the first loop, and
+    represents `members` peers; `local` is the index of the driven peer's class, `unpaired` the index of its
+    difference loop, None for a single peer; `to` is the index of the other peer's class; `same` states
+    whether both are one peer. `exchange` is the communication graph.
     """
 
     exchange: CommunicationGraph
@@ -223,30 +233,32 @@ class Responses:
 
     @functools.cached_property
     def copies(self) -> list[tuple[str, int] | None]:
-        """The quantity whose position each class sends, and the index of that state."""
+        """For each class, the name of the object whose position it sends, and the index of that state."""
         return [_copy_of(subsystem.group, self.device) for subsystem in self.loops[0].subsystems]
 
     @property
     def object(self) -> str:
-        """The copied quantity of the driven peer, "" if none."""
+        """The name of the driven peer's object copy, "" if it sends none."""
         local = self.copies[self.local]
         return local[0] if local else ""
 
     @property
     def frame(self) -> float:
-        """The length of a frame, in s."""
+        """The length of a frame in seconds."""
         return float(self.loops[0].frame)
 
     @property
     def parts(self) -> list[tuple[int, int, float]]:
-        """The modes of the driven peer: the loop, the subsystem, and the share of the force on the peer."""
+        """The modes of the driven peer: index of the loop, index of the subsystem, share of the force in
+        the mode.
+        """
         n = self.members[self.local]
         common = (0, self.local, 1 / n)
         return [common] if self.unpaired is None else [common, (self.unpaired, 0, 1 - 1 / n)]
 
     @functools.cached_property
     def bases(self) -> tuple[Floats, ...]:
-        """The rigid modes of each loop."""
+        """The bases of the rigid modes of each loop."""
         return tuple(find_rigid_modes(loop).basis for loop in self.plain)
 
     @functools.cached_property
@@ -255,92 +267,98 @@ class Responses:
         return any(basis.size for basis in self.bases)
 
     def steady(self, s: Complex, aliases: Sequence[int]) -> list[Carried]:
-        """Return the responses on the imaginary axis, also at multiples of the frame rate.
+        """Return the responses (see `at`) on the imaginary axis, also at multiples of the frame rate.
 
         Notes
         -----
-        There e^{sT} = 1, and the equations of a frame of a model with rigid modes are singular, although the
-        response has a value: the mean over a circle about s. The mean of the values times the direction is 0
-        if no pole is inside.
+        At these e^{sT} = 1, and the equations of a frame of a model with rigid modes are singular, although
+        the response is finite: it is the mean over a circle about s. The mean of the values times the
+        direction is 0 if no pole is inside.
         """
-        rotations = s.imag * self.frame / (2 * np.pi)
-        near = (np.abs(rotations - np.round(rotations)) < NEAR) & (rotations > 0.5)
+        cycles = s.imag * self.frame / (2 * np.pi)
+        near = (np.abs(cycles - np.round(cycles)) < NEAR) & (cycles > 0.5)
         near = near & self.drifting if near.any() else near
-        pairs = [(np.zeros(len(s), np.complex128), np.zeros(len(s))) for _ in range(len(aliases) + 2)]
+        results = [(np.zeros(len(s), np.complex128), np.zeros(len(s))) for _ in range(len(aliases) + 2)]
         if not near.all():
-            for (value, error_bound), (local, uncertainty) in zip(
-                pairs, self.at(s[~near], aliases), strict=True
+            for (value, error_bound), (values, bounds) in zip(
+                results, self.at(s[~near], aliases), strict=True
             ):
-                value[~near], error_bound[~near] = local, uncertainty
-        around = ASIDE * np.exp(2j * np.pi * (np.arange(AROUND) + 0.5) / AROUND)
+                value[~near], error_bound[~near] = values, bounds
+        offsets = ASIDE * np.exp(2j * np.pi * (np.arange(AROUND) + 0.5) / AROUND)
         for index in np.flatnonzero(near):
-            circles = self.at(s[index] + np.concatenate([2 * around, around]), aliases)
-            for (value, error_bound), (local, uncertainty) in zip(pairs, circles, strict=True):
-                inner = local[AROUND:]
-                pole = abs((inner * around).mean()) / ASIDE
+            circles = self.at(s[index] + np.concatenate([2 * offsets, offsets]), aliases)
+            for (value, error_bound), (values, bounds) in zip(results, circles, strict=True):
+                inner = values[AROUND:]
+                pole = abs((inner * offsets).mean()) / ASIDE
                 value[index] = inner.mean()
-                error_bound[index] = abs(local[:AROUND].mean() - value[index]) + pole + uncertainty.max()
-        return pairs
+                error_bound[index] = abs(values[:AROUND].mean() - value[index]) + pole + bounds.max()
+        return results
 
     def at(
         self, s: Complex, aliases: Sequence[int] = (0,), *, difference_loops: bool = True
     ) -> list[Carried]:
-        """Return the velocity here at each alias, the velocity there, and the copy's error (k,).
+        """Return the velocity of the driven device at each alias, that of the other device, and the copy's
+        error (k,).
 
-        The last is 0 unless `difference_loops` requests the distance of copies.
+        The copy's error is 0 unless `difference_loops` is True.
         """
-        requested = [(self.velocity, alias) for alias in aliases]
-        requested += [(self.arriving, 0), (self.error if difference_loops else ({}, {}), 0)]
-        matrices: list[Matrix] = [np.zeros((len(s), 2, 1, 1), np.complex128) for _ in requested]
+        outputs = [(self.velocity, alias) for alias in aliases]
+        outputs += [(self.arriving, 0), (self.error if difference_loops else ({}, {}), 0)]
+        matrices: list[Matrix] = [np.zeros((len(s), 2, 1, 1), np.complex128) for _ in outputs]
         for part, (number, subsystem, share) in enumerate(self.parts):
             rows = [
-                (of, (*index, alias), weight)
-                for of, (weights, alias) in enumerate(requested)
+                (output, (*index, alias), weight)
+                for output, (weights, alias) in enumerate(outputs)
                 for index, weight in weights[part].items()
             ]
-            moved = spectra(self.loops[number], subsystem, [row for _, row, _ in rows], s)
-            for (of, _, weight), matrix in zip(rows, moved, strict=True):
-                by = np.array([[weight * share]])
-                matrices[of] = MIDPOINT_RADIUS.add(
-                    matrices[of],
-                    MIDPOINT_RADIUS.multiply(matrix, with_error_radius(by, 8 * UNIT_ROUNDOFF * np.abs(by))),
+            response = spectra(self.loops[number], subsystem, [row for _, row, _ in rows], s)
+            for (output, _, weight), matrix in zip(rows, response, strict=True):
+                factor = np.array([[weight * share]])
+                matrices[output] = MIDPOINT_RADIUS.add(
+                    matrices[output],
+                    MIDPOINT_RADIUS.multiply(
+                        matrix, with_error_radius(factor, 8 * UNIT_ROUNDOFF * np.abs(factor))
+                    ),
                 )
         return [(matrix[:, 0, 0, 0], matrix[:, 1, 0, 0].real) for matrix in matrices]
 
     @property
     def velocity(self) -> Weights:
-        """The velocity of the driven device as a quantity."""
+        """The weights of the driven device's velocity."""
         return {(self.local, self.device.velocity): 1.0}, {(0, self.device.velocity): 1.0}
 
     @property
     def arriving(self) -> Weights:
-        """The velocity of the other device as a quantity: the differences of peers of a class sum to 0."""
+        """The weights of the other device's velocity; the differences of the peers of a class sum to 0."""
         share = 1.0 if self.same else 1 / (1 - self.members[self.local]) if self.local == self.to else 0.0
         difference_loops = {(0, self.other.velocity): share} if share else {}
         return {(self.to, self.other.velocity): 1.0}, difference_loops
 
     @property
     def error(self) -> Weights:
-        """Distance of the driven peer's copy from the mean of all others of its name; None if alone"""
-        pushed = self.copies[self.local]
+        """The weights of the distance of the driven peer's copy from the mean of the others.
+
+        The weights are empty without other copies.
+        """
+        driven_copy = self.copies[self.local]
         others = {
             (index, copy[1]): self.members[index] - (index == self.local)
             for index, copy in enumerate(self.copies)
-            if pushed and copy and copy[0] == pushed[0]
+            if driven_copy and copy and copy[0] == driven_copy[0]
         }
         total = sum(others.values())
-        if pushed is None or not total:
+        if driven_copy is None or not total:
             return {}, {}
-        common = {index: (index[0] == self.local) - many / total for index, many in others.items()}
+        common = {index: (index[0] == self.local) - count / total for index, count in others.items()}
         return {index: weight for index, weight in common.items() if abs(weight) > UNIT_ROUNDOFF}, {
-            (0, pushed[1]): 1 + 1 / total
+            (0, driven_copy[1]): 1 + 1 / total
         }
 
 
 def _copy_of(group: PeerClass, device: Device) -> tuple[str, int] | None:
-    """Return the copied quantity that a peer sends the position of, and its state; None if there is none.
+    """Return the object copy whose position a peer sends, and the index of its state; None without a copy.
 
-    Of a position with several axes it is the one along the axis of the driven device.
+    If the position has several axes, the axis of the driven device is used.
     """
     _, axis = whole_and_index(device.part)
     peer_type = group.jacobians.peer_type

@@ -1,9 +1,9 @@
-"""Published sufficient conditions for a wall behind a quantized position, where a topology has their form.
+"""Published sufficient conditions for a wall behind a quantized position, for models of their form.
 
 Takes: a `Model`.
 Gives: `published_limits`.
-Guarantees: a condition is evaluated only for single devices against one wall, every part of which declares
-its symbols, and within its assumptions.
+Guarantees: a condition is evaluated only for single devices against one wall whose parts all declare their
+symbols, and within its assumptions.
 Does not: decide a verdict.
 """
 
@@ -12,16 +12,16 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from apc.compiler.compiled import Model, PeerType
-from apc.frame.parameters import ResolvedNumbers, resolve
 from apc.haptics.wall_conditions import CONDITIONS, UNITS
+from apc.parameter_values.parameters import ResolvedNumbers, resolve
 
 MOVING = 2  # states of a device of one degree of freedom
 
-_SCALES = {"ms": 1e3}  # of the units in which a symbol is shown
+_SCALES = {"ms": 1e3}  # factors from SI to the units of symbols
 
 
 def published_limits(system: Model) -> tuple[str, ...]:
-    """Return a line for each published condition that covers a wall and a quantized position.
+    """Return one sentence for each published condition that applies to a wall and a quantized position.
 
     Parameters
     ----------
@@ -34,21 +34,25 @@ def published_limits(system: Model) -> tuple[str, ...]:
     lines = [
         line
         for index, group in enumerate(system.groups)
-        for line in _of_group(system.peer_types[group.peer_type], numbers, index)
+        for line in _conditions_of_group(system.peer_types[group.peer_type], numbers, index)
     ]
     return tuple(dict.fromkeys(lines))
 
 
-def _of_group(peer_type: PeerType, numbers: ResolvedNumbers, index: int) -> Iterator[str]:
+def _conditions_of_group(peer_type: PeerType, numbers: ResolvedNumbers, index: int) -> Iterator[str]:
+    """Yield one sentence for each published condition that applies to the peers of a group."""
     names: dict[str, list[str]] = {symbol: [] for symbol in UNITS}
     for symbol, name in peer_type.symbols:
         names[symbol].append(name)
     single = all(len(names[symbol]) == 1 for symbol in ("K", "T", "D"))
     if not single or len(peer_type.states) != MOVING:
         return
-    row = dict(zip(peer_type.parameters, numbers.parameters[index][0].tolist(), strict=True))
-    row |= {name: float(value) for name, value in numbers.timings.items()}
-    values = {symbol: sum(row.get(name, 0.0) for name in listed) for symbol, listed in names.items()}
+    value_of = dict(zip(peer_type.parameters, numbers.parameters[index][0].tolist(), strict=True))
+    value_of |= {name: float(value) for name, value in numbers.timings.items()}
+    values = {
+        symbol: sum(value_of.get(name, 0.0) for name in parameter_names)
+        for symbol, parameter_names in names.items()
+    }
     if values["B"] or values["t_d"]:  # the wall has neither damping nor delay of its own
         return
     for name in ("abbott", "diolaiti"):

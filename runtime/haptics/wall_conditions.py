@@ -3,7 +3,7 @@
 Takes: the physical quantities of a condition as arrays, in SI.
 Gives: `PublishedCondition`, `CONDITIONS`.
 Guarantees: each condition carries its source and its assumptions.
-Does not: read models (see `overlay`), or prove that one has the form that a condition assumes.
+Does not: read models (see `overlay`), or check the assumptions of a condition.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ MEANINGS = {
 
 @dataclass(frozen=True, slots=True)
 class PublishedCondition:
-    """A condition of the literature.
+    """A condition from the literature.
 
-    `margin`, over all `symbols` in their order, numbers or arrays in SI, is continuous and above zero where
-    the condition holds. `formula` is the condition as published.
+    `margin` is a function of all `symbols` in their order (numbers or arrays in SI): continuous, and positive
+    where the condition holds. `formula` is the condition as published.
     """
 
     name: str
@@ -65,8 +65,8 @@ CONDITIONS: Mapping[str, PublishedCondition] = {
             source="J. E. Colgate and G. G. Schenkel, J. Robotic Systems 14(1) (1997) 37",
             assumptions=(
                 "a device of one degree of freedom: mass and viscous damping",
-                "the wall's velocity by backward difference, its force held from sample to sample",
-                "no delay beyond that",
+                "wall velocity by backward difference, zero-order hold of the force",
+                "no further delay",
                 "any passive user",
             ),
             symbols=("K", "b", "B", "T"),
@@ -80,10 +80,10 @@ CONDITIONS: Mapping[str, PublishedCondition] = {
             source="J. J. Gil, E. Sánchez, T. Hulin, C. Preusche and G. Hirzinger, "
             "J. Computing and Information Science in Engineering 9(1) (2009) 011005",
             assumptions=(
-                "a linear system: contact lasts",
+                "linear system, permanent contact",
                 "short delays and fast sampling",
                 "little physical and virtual damping for the mass",
-                "no user holds the device",
+                "no user at the device",
             ),
             symbols=("K", "b", "B", "T", "t_d"),
             margin=lambda K, b, B, T, t_d: b + B - K * (T / 2 + t_d),
@@ -92,13 +92,13 @@ CONDITIONS: Mapping[str, PublishedCondition] = {
             name="diolaiti",
             title="Diolaiti et al.",
             formula="b/(K T) ≥ 1/2 + t_d/T",
-            condition="viscous damping pays for sampling and delay",
+            condition="viscous damping compensates sampling and delay",
             source="N. Diolaiti, G. Niemeyer, F. Barbagli and J. K. Salisbury, "
             "IEEE Trans. Robotics 22(2) (2006) 256",
             assumptions=(
                 "a device of one degree of freedom: mass and viscous damping",
-                "a wall without damping of its own, its force held from sample to sample",
-                "what the sensor's resolution adds is left out",
+                "a wall without damping, with zero-order hold of its force",
+                "the resolution of the sensor is neglected",
             ),
             symbols=("K", "b", "T", "t_d"),
             margin=lambda K, b, T, t_d: b - K * (T / 2 + t_d),
@@ -107,12 +107,12 @@ CONDITIONS: Mapping[str, PublishedCondition] = {
             name="abbott",
             title="Abbott and Okamura",
             formula="K ≤ min(2 b/T, 2 c/D)",
-            condition="the wall is passive in spite of a quantized position",
+            condition="the wall is passive with a quantized position",
             source="J. J. Abbott and A. M. Okamura, IEEE Trans. Robotics 21(5) (2005) 952",
             assumptions=(
                 "a device of one degree of freedom: mass, viscous damping and Coulomb friction",
-                "a wall without damping of its own, its force held from sample to sample",
-                "no delay beyond that",
+                "a wall without damping, with zero-order hold of its force",
+                "no further delay",
             ),
             symbols=("K", "b", "T", "c", "D"),
             margin=lambda K, b, T, c, D: np.minimum(b - K * T / 2, c - K * D / 2),

@@ -1,6 +1,6 @@
 """The mean dynamics and the channel noise of a model: the parts of its second-moment operator.
 
-Takes: a `Model` whose links lose or delay packets independently of each other.
+Takes: a `NumericModel` whose links lose or delay packets independently of each other.
 Gives: `class_moments`; `Classes`, `classes_of`, `moments_of`; `PerTickReception`, `build_reception`,
 `local_value`; `peer_classes`, `stored_of`, `neutral_motions`, `instants`; `PeerVersusRest`,
 `MomentCoordinates`, `Moments`.
@@ -22,30 +22,12 @@ from numpy.typing import NDArray
 
 from apc.analysis.analysis import lifted_groups
 from apc.compiler.compiled import Clock, Model, PeerType
-from apc.eigen.interconnection import Coupling, ModalSystem, without_packets
-from apc.eigen.modes import complete_degrees, complete_loops, couple, dense_loop, split_exchangeable
-from apc.eigen.peer_classes import PeerClass, used_coupling_terms
-from apc.eigen.relative_coordinates import Relative
-from apc.eigen.rigid_modes import find_rigid_modes
-from apc.frame.communication_graph import CommunicationGraph
-from apc.frame.interval_arithmetic import error_radius, value_of
-from apc.frame.lift import FrameMap
-from apc.frame.numeric_model import PeerIndices, Prepared
-from apc.frame.parameters import resolve
-from apc.frame.schedule import (
-    CouplingTerm,
-    Event,
-    Schedule,
-    SendEvent,
-    SentSample,
-    Tick,
-    UncertainSample,
-    with_per_tick_inputs,
-)
-from apc.frame.scheduling import build_schedules
-from apc.frame.taylor_models import arithmetic_of
+from apc.lifting.interval_arithmetic import error_radius, value_of
+from apc.lifting.lift import FrameMap
+from apc.lifting.numeric_model import NumericModel, PeerIndices
+from apc.lifting.taylor_models import arithmetic_of
 from apc.mean_square.mean_dynamics import (
-    Listened,
+    ReceivedChannel,
     ReceptionChannel,
     Route,
     RouteMemory,
@@ -55,12 +37,29 @@ from apc.mean_square.mean_dynamics import (
 from apc.mean_square.receiver_memory import memory_of
 from apc.mean_square.second_moment_operator import MomentBlock, Operator
 from apc.network.channel import ChannelLaw, channel_law
+from apc.spectrum.interconnection import Coupling, ModalSystem, without_packets
+from apc.spectrum.modes import complete_degrees, complete_loops, couple, dense_loop, split_exchangeable
+from apc.spectrum.peer_classes import PeerClass, used_coupling_terms
+from apc.spectrum.relative_coordinates import Relative
+from apc.spectrum.rigid_modes import find_rigid_modes
+from apc.timing.communication_graph import CommunicationGraph
+from apc.timing.schedule import (
+    CouplingTerm,
+    Event,
+    Schedule,
+    SendEvent,
+    SentSample,
+    Tick,
+    UncertainSample,
+    with_per_tick_inputs,
+)
+from apc.timing.scheduling import build_schedules
 
 Floats = NDArray[np.float64]
 Matrix = NDArray[Any]
 Flags = NDArray[np.bool_]
 
-# No share lost is off by anything.
+# No loss probability has an error.
 EXACTLY: Mapping[str, tuple[float, ...]] = {}
 
 # A link on which every packet takes the nominal delay.
@@ -77,7 +76,7 @@ class PerTickReception:
     timings: Mapping[str, Fraction]
     frame: Fraction
     quantum: Fraction
-    strictly: bool  # a tick misses what arrives just then
+    strictly: bool  # a tick does not receive a packet that arrives at the same instant
 
     def of(self, loop: ModalSystem) -> list[tuple[UncertainSample, ...]]:
         """Return the received sample of each row of r, for each subsystem of a loop."""
@@ -85,78 +84,81 @@ class PerTickReception:
 
 
 def build_reception(
-    system: Model, prepared: Prepared, *, first: Fraction = Fraction(0), stand_in: bool = False
+    numeric: NumericModel, *, first: Fraction = Fraction(0), stand_in: bool = False
 ) -> PerTickReception:
-    """Lift the peers of a model with a row of r for each tick that receives.
+    """Return the peers of a model, lifted with a row of r for each tick that receives.
 
     Parameters
     ----------
-    system, prepared
-        The model, and its result of `numeric_model.prepare`.
+    numeric
+        The model with its parameter values.
     first
         The start of the frames, in seconds.
     stand_in
-        Whether peers send, at each tick, their substitute for a missing value (see `local_value`).
+        Whether peers send, at each tick, their own value as a substitute for a missing one.
     """
-    timings = dict(resolve(system).timings)
+    system = numeric.model
+    timings = dict(numeric.timings)
     for clock in system.clocks:
         timings[clock.phase] = (timings[clock.phase] - first) % timings[clock.period]
-    patterns = [subsystem.pattern for subsystem in prepared.jacobians]
+    patterns = [subsystem.pattern for subsystem in numeric.jacobians]
     stored = {link.name: 0 for link in system.links}
-    schedules = build_schedules(system, timings, patterns, order=prepared.order, stored=stored)
-    peer_versus_rest = {
-        (id(schedule), group.peer_type): substituting(schedule, system.peer_types[group.peer_type])
+    schedules = build_schedules(system, timings, patterns, order=numeric.order, stored=stored)
+    schedules_per_tick = {
+        (id(schedule), group.peer_type): with_substitutes(schedule, system.peer_types[group.peer_type])
         if stand_in
         else with_per_tick_inputs(schedule)
         for schedule, group in zip(schedules, system.groups, strict=True)
     }
     by_tick = tuple(
-        peer_versus_rest[id(schedule), group.peer_type]
+        schedules_per_tick[id(schedule), group.peer_type]
         for schedule, group in zip(schedules, system.groups, strict=True)
     )
-    rows = {id(local): schedule.selected for schedule, local in zip(schedules, by_tick, strict=True)}
-    moved = replace(
+    rows = {id(per_tick): schedule.selected for schedule, per_tick in zip(schedules, by_tick, strict=True)}
+    shifted_system = replace(
         system, timings=tuple(replace(timing, value=timings[timing.name]) for timing in system.timings)
     )
-    groups, exchange = lifted_groups(moved, prepared=replace(prepared, schedules=by_tick, timings=timings))
-    strictly = prepared.order.index("tick") < prepared.order.index("deliver")
+    groups, exchange = lifted_groups(replace(numeric, model=shifted_system, given_schedules=by_tick))
+    strictly = numeric.order.index("tick") < numeric.order.index("deliver")
     frame, quantum = schedules[0].frame_s, schedules[0].quantum
     return PerTickReception(groups, exchange, rows, timings, frame, quantum, strictly)
 
 
 def local_value(row: UncertainSample) -> SentSample:
-    """Return the name of a peer's own value at a tick, the substitute for a missing one."""
+    """Return the name of a peer's own value at a tick, its substitute for a missing value."""
     return SentSample(f"{row.coupling_term.link} at {row.clock}", row.channel, row.tick)
 
 
-def substituting(schedule: Schedule, peer_type: PeerType) -> Schedule:
-    """Return `with_per_tick_inputs` of a schedule that also sends the substitutes for missing values at the
-    ticks.
+def with_substitutes(schedule: Schedule, peer_type: PeerType) -> Schedule:
+    """Return `with_per_tick_inputs` of a schedule that also sends substitutes for missing values at
+    the ticks.
     """
     partition = {send.link: index for index, send in enumerate(peer_type.sends)}
     sent = list(schedule.sent)
     events: list[Event] = []
     for event in schedule.events:
         indices = (
-            [index for listed in event.input_rows for index in listed] if isinstance(event, Tick) else []
+            [index for rows_of_receive in event.input_rows for index in rows_of_receive]
+            if isinstance(event, Tick)
+            else []
         )
         for row in (schedule.selected[index - len(schedule.received)] for index in indices):
             if row.gap:
-                local = local_value(row)
-                if local not in sent:
-                    sent.append(local)
+                own_value = local_value(row)
+                if own_value not in sent:
+                    sent.append(own_value)
                 number = partition[row.coupling_term.link]
                 channel = peer_type.sends[number].channels.index(row.channel)
-                events.append(SendEvent(number, ((channel, sent.index(local)),)))
+                events.append(SendEvent(number, ((channel, sent.index(own_value)),)))
         events.append(event)
-    more = len(sent) - len(schedule.sent)
+    added_count = len(sent) - len(schedule.sent)
     return replace(
         with_per_tick_inputs(schedule),
         events=tuple(events),
         sent=tuple(sent),
-        depths=(*schedule.depths, *[0] * more),
+        depths=(*schedule.depths, *[0] * added_count),
         sent_names=(*schedule.sent_names, *[item.link for item in sent[len(schedule.sent) :]]),
-        sent_times=(*schedule.sent_times, *[0] * more),
+        sent_times=(*schedule.sent_times, *[0] * added_count),
         repeats=None,
     )
 
@@ -165,20 +167,24 @@ def substituting(schedule: Schedule, peer_type: PeerType) -> Schedule:
 class PeerVersusRest:
     """A loop in which one peer of a class, its first subsystem, deviates from the other peers.
 
-    `of` is the class of each subsystem. `many` is, per subsystem, the number of peers that could replace the
-    first subsystem in relation to a peer of that subsystem; it weighs the channel noise from all of them.
-    `neutral` are the loop's rigid motions over the subsystems' own z.
+    `class_of` is the class of each subsystem. `candidates` is, for each subsystem, the number of peers that
+    can be the first subsystem, seen from a peer of that subsystem: it weights the channel noise from all of
+    them. `neutral` are the loop's rigid motions over the subsystems' own z.
     """
 
     loop: ModalSystem
-    of: tuple[int, ...]
-    many: tuple[int, ...]
+    class_of: tuple[int, ...]
+    candidates: tuple[int, ...]
     neutral: Floats
 
-    def subsystems_of(self, which: int) -> list[tuple[int, int]]:
-        """Return the subsystems of a class, and `many` of each."""
-        listed = enumerate(zip(self.of, self.many, strict=True))
-        return [(subsystem, many) for subsystem, (local, many) in listed if local == which]
+    def subsystems_of(self, class_index: int) -> list[tuple[int, int]]:
+        """Return the subsystems of a class, each with its number of `candidates`."""
+        pairs = enumerate(zip(self.class_of, self.candidates, strict=True))
+        return [
+            (subsystem, weight)
+            for subsystem, (subsystem_class, weight) in pairs
+            if subsystem_class == class_index
+        ]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -200,40 +206,43 @@ class Classes:
 
 
 def classes_of(reception: PerTickReception) -> Classes:
-    """Return the loops of a model with their rigid motions."""
+    """Return the classes of exchangeable peers of a model, with the loops and rigid motions of each."""
     common, weights = peer_classes(reception)
     loops = []
-    for which, local in enumerate(common.subsystems):
-        alone = PeerIndices((range(local.peers.first, local.peers.first + 1),))
-        subsystems = [(which, replace(local, count=1, peers=alone), 1)]
+    for class_index, peer_class in enumerate(common.subsystems):
+        one_peer = PeerIndices((range(peer_class.peers.first, peer_class.peers.first + 1),))
+        subsystems = [(class_index, replace(peer_class, count=1, peers=one_peer), 1)]
         for g, subsystem in enumerate(common.subsystems):
-            first = int(g == which)
+            first = int(g == class_index)
             if count := subsystem.count - first:
-                many = count if first else local.count
+                candidates = count if first else peer_class.count
                 others = subsystem.peers.others if first else subsystem.peers
-                subsystems.append((g, replace(subsystem, count=count, peers=others), many))
+                subsystems.append((g, replace(subsystem, count=count, peers=others), candidates))
         coupling = {
             coupling_term: tuple(
-                tuple(rows[g][h] * (to.count - (index == of)) for of, (h, to, _) in enumerate(subsystems))
+                tuple(
+                    rows[g][h] * (sender_class.count - (index == column))
+                    for column, (h, sender_class, _) in enumerate(subsystems)
+                )
                 for index, (g, *_) in enumerate(subsystems)
             )
             for coupling_term, rows in weights.items()
         }
-        loop = ModalSystem(local.name, 1, tuple(subsystem for _, subsystem, _ in subsystems), coupling)
-        listed = tuple(g for g, *_ in subsystems), tuple(many for *_, many in subsystems)
-        loops.append(PeerVersusRest(loop, *listed, neutral_motions(loop)))
+        loop = ModalSystem(peer_class.name, 1, tuple(subsystem for _, subsystem, _ in subsystems), coupling)
+        class_data = tuple(g for g, *_ in subsystems), tuple(candidates for *_, candidates in subsystems)
+        loops.append(PeerVersusRest(loop, *class_data, neutral_motions(loop)))
     return Classes(reception, common, weights, tuple(loops))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MomentCoordinates:
-    """The coordinates of a block: relative coordinates `at` of a loop whose subsystems begin at `offsets`.
+    """The coordinates of a block: relative coordinates of a loop whose subsystems begin at `offsets`.
 
-    It represents `received` channels to the loop's first subsystem, or that subsystem itself.
+    The block represents `received` channels to the loop's first subsystem; None: the subsystem itself.
     """
 
     loop: PeerVersusRest
-    at: Relative
+    coordinates: Relative
     offsets: tuple[int, ...]
     received: int | None = None
 
@@ -262,7 +271,7 @@ class _MomentClass:
     sender: int
     receiver: int
     received: int
-    listened: Listened
+    received_channel: ReceivedChannel
     noises: range
     noise_covariances: tuple[Matrix, ...]
 
@@ -277,53 +286,62 @@ def class_moments(system: Model, reception: PerTickReception) -> Moments:
     reception
         The peers of the model.
     """
-    of = classes_of(reception)
-    return moments_of(of, stored_of(system, of.reception, of.common))
+    classes = classes_of(reception)
+    return moments_of(classes, stored_of(system, classes.reception, classes.common))
 
 
 def moments_of(
-    of: Classes, memories: Sequence[RouteMemory], frames: Mapping[str, FrameMap] | None = None
+    classes: Classes, memories: Sequence[RouteMemory], frames: Mapping[str, FrameMap] | None = None
 ) -> Moments:
     """Return the second-moment operator for classes of exchangeable peers.
 
     Parameters
     ----------
-    of
-        The classes.
+    classes
+        The classes of exchangeable peers.
     memories
         From `stored_of`.
     frames
         As for `mean_dynamics.mean_loop`.
     """
-    peer_types = _peer_types(of, memories)
-    noise_covariances = [spread for peer_type in peer_types for spread in peer_type.noise_covariances]
-    widths = [len(spread[0]) for spread in noise_covariances]
+    moment_classes = _moment_classes(classes, memories)
+    noise_covariances = [
+        covariance for moment_class in moment_classes for covariance in moment_class.noise_covariances
+    ]
+    widths = [len(covariance[0]) for covariance in noise_covariances]
     blocks, moving, states = list[MomentBlock](), list[MomentCoordinates](), 0
-    for h, peer_versus_rest in enumerate(of.loops):
-        driving = [peer_type for peer_type in peer_types if peer_type.receiver == h]
-        rows = of.reception.of(peer_versus_rest.loop)
-        listened = [peer_type.listened for peer_type in driving]
-        mean = mean_loop(peer_versus_rest.loop, rows, memories, listened, peer_versus_rest.neutral, frames)
-        n = len(mean.at.rest)
-        for peer_type, channel in [(None, None), *zip(driving, mean.channels, strict=True)]:
-            local = np.arange(n) if channel is None else np.r_[0:n, channel.stored]
+    for h, peer_versus_rest in enumerate(classes.loops):
+        driving = [moment_class for moment_class in moment_classes if moment_class.receiver == h]
+        rows = classes.reception.of(peer_versus_rest.loop)
+        received_channels = [moment_class.received_channel for moment_class in driving]
+        mean = mean_loop(
+            peer_versus_rest.loop, rows, memories, received_channels, peer_versus_rest.neutral, frames
+        )
+        n = len(mean.coordinates.rest)
+        for moment_class, channel in [(None, None), *zip(driving, mean.channels, strict=True)]:
+            indices = np.arange(n) if channel is None else np.r_[0:n, channel.stored]
             noise = channel.noise if channel else range(0)
-            forms = _forms(peer_types, peer_versus_rest, mean.reception_errors, peer_type, channel)
+            forms = _forms(moment_classes, peer_versus_rest, mean.reception_errors, moment_class, channel)
             blocks.append(
-                _block(mean.matrix, local, noise, forms, widths, peer_type.noises if peer_type else ())
+                _block(
+                    mean.matrix, indices, noise, forms, widths, moment_class.noises if moment_class else ()
+                )
             )
             moving.append(
                 MomentCoordinates(
-                    peer_versus_rest, mean.at, mean.offsets, peer_type.received if peer_type else None
+                    peer_versus_rest,
+                    mean.coordinates,
+                    mean.offsets,
+                    moment_class.received if moment_class else None,
                 )
             )
-            states = max(states, len(local))
-    width, like = max(widths, default=0), blocks[0].matrix
-    listed = np.zeros((len(widths), len(like), width, width))
-    for local, spread, size in zip(listed, noise_covariances, widths, strict=True):
-        local[: len(spread), :size, :size] = spread
+            states = max(states, len(indices))
+    width, first_matrix = max(widths, default=0), blocks[0].matrix
+    covariances = np.zeros((len(widths), len(first_matrix), width, width))
+    for padded, covariance, size in zip(covariances, noise_covariances, widths, strict=True):
+        padded[: len(covariance), :size, :size] = covariance
     entries = sum(size * (size + 1) // 2 for size in widths)
-    return Moments(Operator(tuple(blocks), listed), tuple(moving), entries, states)
+    return Moments(Operator(tuple(blocks), covariances), tuple(moving), entries, states)
 
 
 # A source of noise: its index, its weight, and its linear form over a block's states and noise.
@@ -331,47 +349,50 @@ Form = tuple[int, float, Matrix]
 
 
 def _forms(
-    peer_types: Sequence[_MomentClass],
+    moment_classes: Sequence[_MomentClass],
     peer_versus_rest: PeerVersusRest,
     reception_errors: Mapping[tuple[int, Route, int], Matrix],
-    peer_type: _MomentClass | None,
+    moment_class: _MomentClass | None,
     channel: ReceptionChannel | None,
 ) -> list[Form]:
-    """Return the linear forms of the noise sources over a loop driven by channels of one type, or by none.
+    """Return the linear forms of the noise sources over a loop that channels of one class drive, or over no
+    channel.
 
     Parameters
     ----------
-    peer_types, peer_versus_rest
-        All channel types, and the loop.
+    moment_classes, peer_versus_rest
+        All channel classes, and the loop.
     reception_errors
         The difference between sent and received values, by subsystem, route and slot.
-    peer_type, channel
-        The type of the driving channel, and the channel in the loop.
+    moment_class, channel
+        The class of the driving channel, and the channel in the loop; None without a channel.
     """
     forms = []
-    for target in peer_types:
-        for (slot, noise), (subsystem, many) in itertools.product(
+    for target in moment_classes:
+        for (slot, noise), (subsystem, candidates) in itertools.product(
             enumerate(target.noises), peer_versus_rest.subsystems_of(target.sender)
         ):
-            miss = reception_errors[subsystem, target.listened.route, slot]
-            weight = many * (1 if peer_type is None else peer_type.received)
+            error_form = reception_errors[subsystem, target.received_channel.route, slot]
+            weight = candidates * (1 if moment_class is None else moment_class.received)
             if (
-                channel and target is peer_type and subsystem
+                channel and target is moment_class and subsystem
             ):  # one of these channels is that whose packet it is
                 weight -= 1
-                forms.append((noise, 1.0, arithmetic_of(miss).add(miss, channel.reception_errors[slot])))
+                forms.append(
+                    (noise, 1.0, arithmetic_of(error_form).add(error_form, channel.reception_errors[slot]))
+                )
             if weight:
-                forms.append((noise, float(weight), miss))
+                forms.append((noise, float(weight), error_form))
     return forms
 
 
 def _block(
     matrix: Matrix,
-    local: NDArray[np.intp],
+    states: NDArray[np.intp],
     noise: range,
     forms: Sequence[Form],
     widths: Sequence[int],
-    by: Sequence[int],
+    noises: Sequence[int],
 ) -> MomentBlock:
     """Return a block of the operator.
 
@@ -379,60 +400,66 @@ def _block(
     ----------
     matrix
         The state matrix of a loop.
-    local, noise
+    states, noise
         The indices of the block's states, and of the noise states that drive it.
     forms
         The linear forms of the noise sources over the states.
-    widths, by
+    widths, noises
         The dimension of each noise vector, and the indices of those that drive the block, in order.
     """
     p = max(widths, default=0)
-    ends = np.cumsum([noise.start, *(widths[noise] for noise in by)]).tolist()
+    ends = np.cumsum([noise.start, *(widths[source] for source in noises)]).tolist()
     spans = [slice(*span) for span in itertools.pairwise(ends)]
-    enters = np.zeros((len(by), len(matrix), len(local), p))
-    observed, shares = np.zeros((len(forms), len(matrix), p, len(local))), np.zeros((len(widths), len(forms)))
-    at_once = np.zeros((len(forms), len(by), len(matrix), p, p))
+    noise_inputs = np.zeros((len(noises), len(matrix), len(states), p))
+    noise_forms, shares = (
+        np.zeros((len(forms), len(matrix), p, len(states))),
+        np.zeros((len(widths), len(forms))),
+    )
+    same_frame = np.zeros((len(forms), len(noises), len(matrix), p, p))
     for e, span in enumerate(spans):
-        enters[e, ..., : span.stop - span.start] = matrix[:, local, span]
+        noise_inputs[e, ..., : span.stop - span.start] = matrix[:, states, span]
     for k, (number, weight, form) in enumerate(forms):
         shares[number, k] = weight
-        observed[k, :, : widths[number]] = form[..., local]
+        noise_forms[k, :, : widths[number]] = form[..., states]
         for e, span in enumerate(spans):
-            at_once[k, e, :, : widths[number], : span.stop - span.start] = form[..., span]
-    moved = matrix[:, local[:, None], local]
-    return MomentBlock(moved, enters, tuple(by), observed, shares, at_once if at_once.any() else None)
+            same_frame[k, e, :, : widths[number], : span.stop - span.start] = form[..., span]
+    inner = matrix[:, states[:, None], states]
+    return MomentBlock(
+        inner, noise_inputs, tuple(noises), noise_forms, shares, same_frame if same_frame.any() else None
+    )
 
 
-def _peer_types(of: Classes, memories: Sequence[RouteMemory]) -> list[_MomentClass]:
-    """Return the kinds of channels left to chance."""
-    peer_types: list[_MomentClass] = []
-    first, counts = 0, of.counts
+def _moment_classes(classes: Classes, memories: Sequence[RouteMemory]) -> list[_MomentClass]:
+    """Return the classes of channels with random losses or delays, with their noise covariances."""
+    moment_classes: list[_MomentClass] = []
+    first, counts = 0, classes.counts
     for memory in memories:
         if not any(memory.sizes):
             continue
         numbers = np.ones((len(memory.channels),) * 2)  # all numbers of a packet are lost together
         noise_covariances = tuple(
-            np.kron(numbers, memory.memory.spread(slot)) for slot in range(memory.memory.slots)
+            np.kron(numbers, memory.memory.replacement_covariance(slot))
+            for slot in range(memory.memory.slots)
         )
         for h, g in itertools.product(range(len(counts)), repeat=2):
             weighed = {
                 coupling_term: rows[h][g]
-                for coupling_term, rows in of.weights.items()
+                for coupling_term, rows in classes.weights.items()
                 if (coupling_term.link, coupling_term.delay) == memory.route
             }
             received = counts[g] - (g == h)
             if received and any(weighed.values()):
                 noises = range(first, first := first + len(noise_covariances))
-                peer_types.append(
+                moment_classes.append(
                     _MomentClass(
-                        g, h, received, Listened(0, memory.route, weighed), noises, noise_covariances
+                        g, h, received, ReceivedChannel(0, memory.route, weighed), noises, noise_covariances
                     )
                 )
-    return peer_types
+    return moment_classes
 
 
 def neutral_motions(loop: ModalSystem) -> Floats:
-    """Return the rigid motions of a loop over its subsystems' own states."""
+    """Return the rigid modes of a loop over its subsystems' own states (n, d)."""
     states = sum(len(subsystem.z_names) for subsystem in loop.subsystems)
     return find_rigid_modes(without_packets(loop), with_drifts=False).basis[:states]
 
@@ -451,19 +478,20 @@ def peer_classes(reception: PerTickReception) -> tuple[ModalSystem, Coupling]:
         degrees = complete_degrees(groups, exchange)
 
         def weight(coupling_term: CouplingTerm, g: int, h: int) -> Fraction:
+            """Return 1 if a class has a peer that a peer of class g receives from, else 0."""
             return Fraction(groups[h].count > (1 if g == h else 0))
 
         return complete_loops(groups, exchange)[0], couple(groups, exchange, weight, degrees)
-    whole = dense_loop(groups, exchange)
-    common = split_exchangeable(whole, exchange)[0]
-    index = {group.peers.first: number for number, group in enumerate(whole.subsystems)}
+    dense = dense_loop(groups, exchange)
+    common = split_exchangeable(dense, exchange)[0]
+    index = {group.peers.first: number for number, group in enumerate(dense.subsystems)}
     first = [index[subsystem.peers.first] for subsystem in common.subsystems]
     last = [index[subsystem.peers.last] for subsystem in common.subsystems]
     weights = {
         coupling_term: tuple(
             tuple(rows[g][last[k] if g == h else h] for k, h in enumerate(first)) for g in first
         )
-        for coupling_term, rows in whole.coupling.items()
+        for coupling_term, rows in dense.coupling.items()
     }
     return common, weights
 
@@ -476,7 +504,7 @@ def stored_of(
     perfect: bool = False,
     lost: Mapping[str, tuple[float, ...]] = EXACTLY,
 ) -> list[RouteMemory]:
-    """Return the receiver memory of each route in use.
+    """Return the receiver memory of each route that affects an output.
 
     Parameters
     ----------
@@ -485,7 +513,7 @@ def stored_of(
     common
         The loop of all classes.
     perfect
-        Whether every packet counts as on time.
+        Whether every packet arrives with its nominal delay.
     lost
         The error bound of a link's loss probability and its change over a cell, by the name of the link, as
         for `receiver_memory.memory_of`.
@@ -493,9 +521,9 @@ def stored_of(
     received: dict[Route, list[UncertainSample]] = {}
     for subsystem, rows in zip(common.subsystems, reception.of(common), strict=True):
         size = subsystem.lifted.mapped(lambda block: np.abs(value_of(block)) + error_radius(block))
-        used: Flags = np.any(size.q, axis=0) | np.any(size.d, axis=0)
+        is_used: Flags = np.any(size.q, axis=0) | np.any(size.d, axis=0)
         for index, row in enumerate(rows):
-            if used[index] and not row.gap:
+            if is_used[index] and not row.gap:
                 received.setdefault((row.coupling_term.link, row.coupling_term.delay), []).append(row)
     links = {link.name: link for link in system.links}
     memories = []

@@ -23,15 +23,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import Model, PeerType
-from apc.eigen.modes import dense_loop
-from apc.eigen.peer_classes import PeerClass
-from apc.eigen.relative_coordinates import Relative
-from apc.frame.devices import Device, coupled_directly, find_device
-from apc.frame.frame_inputs import with_holds, with_ports
-from apc.frame.linear_subsystem import LinearSubsystem
+from apc.lifting.devices import Device, coupled_directly, find_device
+from apc.lifting.frame_inputs import with_holds, with_ports
+from apc.linearization.linear_subsystem import LinearSubsystem
 from apc.mean_square.class_moments import Moments, PerTickReception, instants
-from apc.mean_square.second_moment_operator import settled
-from apc.not_supported import NotSupportedError
+from apc.mean_square.second_moment_operator import stationary_moments
+from apc.spectrum.modes import dense_loop
+from apc.spectrum.peer_classes import PeerClass
+from apc.spectrum.relative_coordinates import Relative
+from apc.support.not_supported import NotSupportedError
 
 Floats = NDArray[np.float64]
 Matrix = NDArray[Any]
@@ -61,16 +61,16 @@ class Forced:
     peers: Mapping[int, PeerReadings]
 
     def of(self, subsystems: Sequence[PeerClass]) -> list[tuple[int, PeerReadings]]:
-        """Return the number of peers of each class, and their readings."""
+        """Return the number of peers of each class, and the class's readings."""
         return [(subsystem.count, self.peers[id(subsystem.schedule)]) for subsystem in subsystems]
 
     def peer_by_peer(self) -> list[tuple[int, PeerReadings]]:
-        """Return the readings of each peer, in order."""
+        """Return the readings of each peer, in the order of peers."""
         return self.of(dense_loop(self.reception.groups, self.reception.exchange).subsystems)
 
 
 def forced(system: Model, reception: PerTickReception, first: Fraction = Fraction(0)) -> Forced:
-    """Add an independent force of variance 1 N² at each hand-held device.
+    """Return the peers with an independent force of variance 1 N² at each hand-held device.
 
     Parameters
     ----------
@@ -88,58 +88,59 @@ def forced(system: Model, reception: PerTickReception, first: Fraction = Fractio
     """
     unit_of = {parameter.name: parameter.unit for parameter in system.parameters}
     direct = coupled_directly(system.peer_types)
-    used = {part.clock for peer_type in system.peer_types for part in peer_type.clocks} | {
+    used_clocks = {part.clock for peer_type in system.peer_types for part in peer_type.clocks} | {
         link.clock for link in system.links
     }
     fastest = min(
-        (clock for clock in system.clocks if clock.name in used),
+        (clock for clock in system.clocks if clock.name in used_clocks),
         key=lambda clock: reception.timings[clock.period],
     )
     ticks = instants(reception, fastest)
     groups, rows, peers = [], {}, {}
-    built: dict[tuple[int, int], tuple[PeerClass, PeerReadings]] = {}
+    forced_groups: dict[tuple[int, int], tuple[PeerClass, PeerReadings]] = {}
     for group in reception.groups:
         key = id(group.schedule), id(group.lifting)
-        if key not in built:
-            held = find_device(
+        if key not in forced_groups:
+            device = find_device(
                 group.jacobians, group.parameters, unit_of, group.initial_reception, direct=direct
             )
-            if isinstance(held, str):
-                raise NotSupportedError(held)
-            built[key] = _forced(group, held, ticks, -first % reception.frame)
-        pushed, peer = built[key]
+            if isinstance(device, str):
+                raise NotSupportedError(device)
+            forced_groups[key] = _forced(group, device, ticks, -first % reception.frame)
+        forced_group, peer = forced_groups[key]
         groups.append(
             replace(
                 group,
-                jacobians=pushed.jacobians,
-                subsystem=pushed.subsystem,
-                exacting=pushed.exacting,
-                schedule=pushed.schedule,
-                lifting=pushed.lifting,
+                jacobians=forced_group.jacobians,
+                subsystem=forced_group.subsystem,
+                exacting=forced_group.exacting,
+                schedule=forced_group.schedule,
+                lifting=forced_group.lifting,
             )
         )
-        rows[id(pushed.schedule)] = reception.rows.get(id(group.schedule), ())
-        peers[id(pushed.schedule)] = peer
+        rows[id(forced_group.schedule)] = reception.rows.get(id(group.schedule), ())
+        peers[id(forced_group.schedule)] = peer
     if not any(peer.input_slots for peer in peers.values()):
-        raise NotSupportedError("no peer holds anything but what it tells others about")
+        raise NotSupportedError("no peer has a device besides its object copies")
     return Forced(replace(reception, groups=tuple(groups), rows=rows), peers)
 
 
 def _forced(
     group: PeerClass, device: Device | None, ticks: Sequence[Fraction], start: Fraction
 ) -> tuple[PeerClass, PeerReadings]:
-    """Return the first peer of a group with forces, drawn as a frame begins, and its copies' positions.
+    """Return a group with a force input at its device, new values at each frame, and readings of its copies'
+    positions.
 
     Parameters
     ----------
     group
         The peers.
     device
-        The driven bodies.
+        The hand-held device, None without one.
     ticks
-        The start of each force, in seconds within a frame.
+        The instants at which forces change, in seconds within a frame.
     start
-        The instants of positions, in seconds within a frame.
+        The instant of the positions, in seconds within a frame.
     """
     peer_type, schedule = group.jacobians.peer_type, group.schedule
     copies = [
@@ -150,20 +151,24 @@ def _forced(
     ]
     subsystems, readings = [], []
     for subsystem in (group.subsystem, group.exact):
-        push = np.zeros((len(subsystem.a), 1), dtype=subsystem.a.dtype)
+        force_column = np.zeros((len(subsystem.a), 1), dtype=subsystem.a.dtype)
         if device is not None:
-            push[device.velocity] += device.inverse if subsystem.a.dtype == object else float(device.inverse)
-        subsystems.append(with_holds(subsystem, push))
+            force_column[device.velocity] += (
+                device.inverse if subsystem.a.dtype == object else float(device.inverse)
+            )
+        subsystems.append(with_holds(subsystem, force_column))
         readings.append(_positions(subsystems[-1], peer_type))
-    at = [int(time / schedule.quantum) for time in ticks] if device is not None else []
-    used = int(start / schedule.quantum)
-    (subsystem, exact), full, ports = with_ports(subsystems, schedule, 1, at, readings, [used])
+    force_instants = [int(time / schedule.quantum) for time in ticks] if device is not None else []
+    reading_instant = int(start / schedule.quantum)
+    (subsystem, exact), extended_schedule, ports = with_ports(
+        subsystems, schedule, 1, force_instants, readings, [reading_instant]
+    )
     input_slots = ports.input_slots.ravel().tolist()
     peer = PeerReadings(
         input_slots=range(input_slots[0], input_slots[-1] + 1) if input_slots else range(0),
         copies=dict(zip(copies, ports.read[0].tolist(), strict=True)),
     )
-    return group.with_subsystem(subsystem, exact, full), peer
+    return group.with_subsystem(subsystem, exact, extended_schedule), peer
 
 
 def _positions(subsystem: LinearSubsystem, peer_type: PeerType) -> Matrix:
@@ -177,95 +182,104 @@ def _positions(subsystem: LinearSubsystem, peer_type: PeerType) -> Matrix:
     return np.array(rows, dtype=subsystem.b.dtype).reshape(len(rows), sum(subsystem.b.shape))
 
 
-def moments_error(of: Moments, classes: Sequence[tuple[int, PeerReadings]]) -> float:
+def moments_error(peer_moments: Moments, classes: Sequence[tuple[int, PeerReadings]]) -> float:
     """Return the largest copy error in m.
 
     Parameters
     ----------
-    of
+    peer_moments
         The second-moment operator of peers with force inputs.
     classes
         The number of peers of each class, and their readings.
     """
-    added = []
-    for moving, n in zip(of.moving, of.operator.sizes, strict=True):
+    inputs = []
+    for block_coordinates, n in zip(peer_moments.moving, peer_moments.operator.sizes, strict=True):
         input_slots = np.zeros(n)
-        if moving.received is None:  # a peer that is pushed
-            _, peer = classes[moving.loop.of[0]]
-            whole = np.zeros(len(moving.at.eliminated) + len(moving.at.rest))
-            whole[np.array(peer.input_slots, np.intp)] = 1.0
-            input_slots[:] = whole[moving.at.rest]
-        added.append(np.diag(input_slots))
-    moments = settled(of.operator, added)
+        if block_coordinates.received is None:  # the block of a peer with a force input
+            _, peer = classes[block_coordinates.loop.class_of[0]]
+            state_inputs = np.zeros(
+                len(block_coordinates.coordinates.eliminated) + len(block_coordinates.coordinates.rest)
+            )
+            state_inputs[np.array(peer.input_slots, np.intp)] = 1.0
+            input_slots[:] = state_inputs[block_coordinates.coordinates.rest]
+        inputs.append(np.diag(input_slots))
+    moments = stationary_moments(peer_moments.operator, inputs)
     variances = dict[tuple[Copy, int], float]()
-    for moving, moment in zip(of.moving, moments, strict=True):
+    for block_coordinates, moment in zip(peer_moments.moving, moments, strict=True):
         subsystems = [
             (subsystem.count, classes[g][1])
-            for subsystem, g in zip(moving.loop.loop.subsystems, moving.loop.of, strict=True)
+            for subsystem, g in zip(
+                block_coordinates.loop.loop.subsystems, block_coordinates.loop.class_of, strict=True
+            )
         ]
-        for copy, index, row in _error_rows(subsystems, moving.at, moving.offsets):
-            n, weight = len(row), moving.loop.many[index] * (moving.received or 1)
-            key = copy, moving.loop.of[index]
+        for copy, index, row in _error_rows(
+            subsystems, block_coordinates.coordinates, block_coordinates.offsets
+        ):
+            n, weight = len(row), block_coordinates.loop.candidates[index] * (block_coordinates.received or 1)
+            key = copy, block_coordinates.loop.class_of[index]
             variances[key] = variances.get(key, 0.0) + weight * float(row @ moment[:n, :n] @ row)
     return _largest(np.array(list(variances.values())))
 
 
 def largest_error(
-    moments: Floats, at: Relative, offsets: Sequence[int], classes: Sequence[tuple[int, PeerReadings]]
+    moments: Floats,
+    coordinates: Relative,
+    offsets: Sequence[int],
+    classes: Sequence[tuple[int, PeerReadings]],
 ) -> float:
-    """Return the largest error of copies in m of peers that are followed one by one.
+    """Return the largest copy error in m, of peers that are single subsystems.
 
     Parameters
     ----------
     moments
         The second moments (n, n) of a long run over relative coordinates.
-    at, offsets
-        These, of states that begin at the offsets, peer by peer.
+    coordinates, offsets
+        The relative coordinates, and the offset of each peer's states.
     classes
         The readings of each peer, as for `moments_error`.
     """
-    rows = _error_rows(classes, at, offsets)
+    rows = _error_rows(classes, coordinates, offsets)
     return _largest(np.array([row @ moments @ row for *_, row in rows]))
 
 
 def _largest(variances: Floats) -> float:
-    """Return the root of the largest variance."""
+    """Return the square root of the largest variance."""
     largest = float(variances.max())
     if not largest >= 0:
-        raise NotSupportedError("rounding leaves its digits in doubt")
+        raise NotSupportedError("rounding exceeds the required accuracy")
     return math.sqrt(largest)
 
 
 def _error_rows(
-    subsystems: Sequence[tuple[int, PeerReadings]], at: Relative, offsets: Sequence[int]
+    subsystems: Sequence[tuple[int, PeerReadings]], coordinates: Relative, offsets: Sequence[int]
 ) -> list[tuple[Copy, int, Floats]]:
-    """Return copy errors over coordinates, with copy and subsystem, for each subsystem with other copies.
+    """Return the error of each copy over relative coordinates, with its copy and subsystem.
 
-    It is x_i − (Σ_j x_j − x_i)/(N − 1).
+    The error is x_i − (Σ_j x_j − x_i)/(N − 1).
 
     Parameters
     ----------
     subsystems
         The number of peers of each subsystem, and their readings.
-    at, offsets
-        Relative coordinates, of states that begin at the offsets, subsystem by subsystem.
+    coordinates, offsets
+        The relative coordinates, and the offset of each subsystem's states.
     """
     errors = []
     for copy in dict.fromkeys(copy for _, peer in subsystems for copy in peer.copies):
-        indices = {
+        state_indices = {
             g: offsets[g] + peer.copies[copy] for g, (_, peer) in enumerate(subsystems) if copy in peer.copies
         }
-        others = sum(subsystems[g][0] for g in indices) - 1
-        for g in indices if others else ():
-            row = np.zeros(len(at.eliminated) + len(at.rest))
-            for k, location in indices.items():
-                row[location] = (k == g) * (1 + 1 / others) - subsystems[k][0] / others
-            moved = row[at.eliminated] + row[at.rest] @ at.weights
-            if np.abs(moved).max(initial=0.0) > NEUTRAL * np.abs(row).max(initial=0.0):
+        others = sum(subsystems[g][0] for g in state_indices) - 1
+        for g in state_indices if others else ():
+            row = np.zeros(len(coordinates.eliminated) + len(coordinates.rest))
+            for subsystem, state_index in state_indices.items():
+                row[state_index] = (subsystem == g) * (1 + 1 / others) - subsystems[subsystem][0] / others
+            neutral_part = row[coordinates.eliminated] + row[coordinates.rest] @ coordinates.weights
+            if np.abs(neutral_part).max(initial=0.0) > NEUTRAL * np.abs(row).max(initial=0.0):
                 raise NotSupportedError(
-                    "nothing holds the copies together: what they differ by grows for ever"
+                    "the object copies are not coupled, so their difference grows without bound"
                 )
-            errors.append((copy, g, row[at.rest]))
+            errors.append((copy, g, row[coordinates.rest]))
     if not errors:
-        raise NotSupportedError("no position of a mass is told to others")
+        raise NotSupportedError("no position is sent to other peers")
     return errors

@@ -1,7 +1,7 @@
 """The loops of mean dynamics, and the effect of one channel's random noise on them.
 
 Takes: the loops of a model with a separate reception at each tick, and the receiver memories of the channels.
-Gives: `RouteMemory`, `route_memory`; `MeanSubsystem`, `with_memory`, `neutral_state`; `Listened`,
+Gives: `RouteMemory`, `route_memory`; `MeanSubsystem`, `with_memory`, `with_stored_values`; `ReceivedChannel`,
 `ReceptionChannel`, `MeanLoop`, `mean_loop`.
 Guarantees: each matrix has an error radius that includes those of the sites' frame maps. Rigid modes, which
 no noise excites, are removed.
@@ -27,21 +27,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
-from apc.eigen.interconnection import (
+from apc.lifting.discretize import TOO_LARGE
+from apc.lifting.interval_arithmetic import UNIT_ROUNDOFF, error_radius, value_of
+from apc.lifting.lift import FrameMap
+from apc.lifting.taylor_models import arithmetic_of, entrywise, hull, over_as_many
+from apc.mean_square.receiver_memory import ReceiverMemory
+from apc.spectrum.interconnection import (
     InterconnectionMatrices,
     ModalSystem,
     StateLayout,
     bounded_weight,
     interconnect,
 )
-from apc.eigen.peer_classes import PeerClass
-from apc.eigen.relative_coordinates import Relative, relative_coordinates, relative_rows, with_uncertainty
-from apc.frame.discretize import TOO_LARGE
-from apc.frame.interval_arithmetic import UNIT_ROUNDOFF, error_radius, value_of
-from apc.frame.lift import FrameMap
-from apc.frame.schedule import CouplingTerm, SentSample, UncertainSample
-from apc.frame.taylor_models import arithmetic_of, entrywise, hull, over_as_many
-from apc.mean_square.receiver_memory import ReceiverMemory
+from apc.spectrum.peer_classes import PeerClass
+from apc.spectrum.relative_coordinates import Relative, relative_coordinates, relative_rows, with_uncertainty
+from apc.timing.schedule import CouplingTerm, SentSample, UncertainSample
 
 Floats = NDArray[np.float64]
 Matrix = NDArray[Any]
@@ -59,8 +59,8 @@ class RouteMemory:
     """The memory of a link's packets with one delay, equal for each of its `channels`.
 
     `after` is each value after all packets are sent, over [stored values, packets sent, noise].
-    `reception_errors` is, for each slot, the difference of its uncertain values from the contents of its
-    packet, before the packet.
+    `reception_errors` is, for each slot, the difference between the content of its packet and its uncertain
+    values before the packet.
     """
 
     route: Route
@@ -74,25 +74,23 @@ class RouteMemory:
         """The number of values that each slot's packet may replace at random."""
         return [len(self.memory.uncertain(slot)) for slot in range(self.memory.slots)]
 
-    def memorized(self, rows: Matrix) -> Matrix:
-        """Return rows of `after` or `reception_errors` over [stored values, noise], for each of the
-        channels.
-        """
+    def of_all_channels(self, rows: Matrix) -> Matrix:
+        """Return rows of `after` or `reception_errors` over [stored values, noise] of all channels."""
         count, first = self.memory.count, self.memory.count + self.memory.slots
         columns = [*range(count), *range(first, first + sum(self.sizes))]
-        inner = rows[..., columns]
-        many = np.kron(np.eye(len(self.channels)), inner)
+        memory_rows = rows[..., columns]
+        all_channels = np.kron(np.eye(len(self.channels)), memory_rows)
         # All values of a channel first, then the noise, slot by slot: the values of one packet are lost
         # together.
-        index = np.arange(many.shape[-1]).reshape(len(self.channels), -1)
+        index = np.arange(all_channels.shape[-1]).reshape(len(self.channels), -1)
         slots = np.split(index[:, count:], np.cumsum(self.sizes)[:-1], axis=1)
         return np.asarray(
-            many[..., [*index[:, :count].ravel(), *(item for slot in slots for item in slot.ravel())]]
+            all_channels[..., [*index[:, :count].ravel(), *(item for slot in slots for item in slot.ravel())]]
         )
 
 
 @dataclass(frozen=True, slots=True)
-class Listened:
+class ReceivedChannel:
     """A channel on `route`, whose receiver is `subsystem`, with `weights` by coupling term."""
 
     subsystem: int
@@ -117,20 +115,20 @@ class ReceptionChannel:
 class MeanLoop:
     """A loop of mean dynamics in relative coordinates, followed by stored values of channels and their noise.
 
-    `matrix` (2, N, N) is the state matrix; of the loop's n states, `at` are the coordinates, and `offsets`
-    the first state of each subsystem. `reception_errors` (2, k, N) is the difference between the uncertain
-    and the sent values of each subsystem's packets, by subsystem, route and slot.
+    `matrix` (2, N, N) is the state matrix; `coordinates` are relative coordinates of the loop's n states, and
+    `offsets` the first state of each subsystem. `reception_errors` (2, k, N) is the difference between the
+    uncertain and the sent values of each subsystem's packets, by subsystem, route and slot.
     """
 
     matrix: Matrix
     channels: tuple[ReceptionChannel, ...]
-    at: Relative
+    coordinates: Relative
     offsets: tuple[int, ...]
     reception_errors: Mapping[tuple[int, Route, int], Matrix]
 
 
 def route_memory(route: Route, memory: ReceiverMemory, channels: Sequence[str]) -> RouteMemory:
-    """Propagate the stored values of a route through a frame."""
+    """Return the memory of a route after one frame: its values over stored values, sent packets and noise."""
     count, slots = memory.count, memory.slots
     sizes = [len(memory.uncertain(slot)) for slot in range(slots)]
     after = np.zeros((2 + len(memory.moves), len(memory.old), count + slots + sum(sizes)))
@@ -145,10 +143,10 @@ def route_memory(route: Route, memory: ReceiverMemory, channels: Sequence[str]) 
         after[:, certain] = 0.0
         after[0, certain, count + slot] = 1.0
         chance = memory.chance(slot)
-        missed = -chance[..., None]
-        missed[0] += 1
-        missed[1] = chance[1, :, None] + UNIT_ROUNDOFF
-        after[:, uncertain] = entrywise(after[:, uncertain], missed)
+        missed_chance = -chance[..., None]
+        missed_chance[0] += 1
+        missed_chance[1] = chance[1, :, None] + UNIT_ROUNDOFF
+        after[:, uncertain] = entrywise(after[:, uncertain], missed_chance)
         after[:, uncertain, count + slot] = chance
         after[0, uncertain, first + np.arange(size)] = 1.0
         first += size
@@ -157,7 +155,7 @@ def route_memory(route: Route, memory: ReceiverMemory, channels: Sequence[str]) 
 
 @dataclass(frozen=True, slots=True)
 class MeanSubsystem:
-    """A subsystem augmented by the mean of its receivers' memory: its map, whose s has three types of rows.
+    """A subsystem with the mean of its receivers' memory as states; s of its map has three types of rows.
 
     `values` are the rows of received values, by route, channel and value; `reception_errors` are the rows of
     differences between a slot's uncertain and sent values; `sent` is the row of each packet as it is sent.
@@ -186,20 +184,20 @@ def with_memory(
     memory
         The memory of each route.
     frame
-        Its frame map, if different from the group's (for example over a cell).
+        The frame map of the subsystem, if different from the group's (for example over a cell).
     """
-    plain, row_of = frame or group.lifted, {sent: row for row, sent in enumerate(group.schedule.sent)}
+    frame_map, row_of = frame or group.lifted, {sent: row for row, sent in enumerate(group.schedule.sent)}
     numbers = [
         (item, channel)
         for item in memory
         for channel in item.channels
         if SentSample(item.route[0], channel, 0) in row_of
     ]
-    counts = [memory.memory.count for memory, _ in numbers]
+    counts = [item.memory.count for item, _ in numbers]
     firsts, n_m, n_s = np.cumsum([0, *counts]), sum(counts), len(row_of)
 
-    def over_all(block: Matrix, index: int) -> Matrix:
-        """Return rows over one number's kept values and packets as rows over those of all."""
+    def over_all_channels(block: Matrix, index: int) -> Matrix:
+        """Return rows over one channel's stored values and packets as rows over those of all channels."""
         memory, channel = numbers[index]
         values = np.zeros((len(block), block.shape[-2], n_m + n_s))
         values[..., firsts[index] : firsts[index + 1]] = block[..., : memory.memory.count]
@@ -214,34 +212,35 @@ def with_memory(
     reception_errors: dict[tuple[Route, int], slice] = {}
     count = 0
     for index, (item, channel) in enumerate(numbers):
-        whole = over_all(item.after, index)
+        channel_rows = over_all_channels(item.after, index)
         values |= {(item.route, channel, value): count + value for value in range(len(item.memory.old))}
-        rows.append(whole)
-        stored.append(whole[:, item.memory.stored])
-        count += whole.shape[-2]
-    for item in dict.fromkeys(memory for memory, _ in numbers):
+        rows.append(channel_rows)
+        stored.append(channel_rows[:, item.memory.stored])
+        count += channel_rows.shape[-2]
+    for item in dict.fromkeys(route_memory for route_memory, _ in numbers):
         for slot in range(item.memory.slots):
             start = count
-            for index, (other, _) in enumerate(numbers):
-                if other is not item:
+            for index, (channel_memory, _) in enumerate(numbers):
+                if channel_memory is not item:
                     continue
-                rows.append(over_all(item.reception_errors[slot], index))
+                rows.append(over_all_channels(item.reception_errors[slot], index))
                 count += rows[-1].shape[-2]
             reception_errors[item.route, slot] = slice(start, count)
-    plainly = np.zeros((2, n_s, n_m + n_s))
-    plainly[0, :, n_m:] = np.eye(n_s)
-    rows, stored = [*rows, plainly], [*stored, np.zeros((2, 0, n_m + n_s))]
-    listed, keeping = (
-        np.concatenate([over_as_many(values, plain.p) for values in some], axis=-2) for some in (rows, stored)
+    sent_rows = np.zeros((2, n_s, n_m + n_s))
+    sent_rows[0, :, n_m:] = np.eye(n_s)
+    rows, stored = [*rows, sent_rows], [*stored, np.zeros((2, 0, n_m + n_s))]
+    output_rows, stored_rows = (
+        np.concatenate([over_as_many(values, frame_map.p) for values in blocks], axis=-2)
+        for blocks in (rows, stored)
     )
-    n_z, multiply = plain.p.shape[-1], arithmetic_of(plain.p).multiply
-    p = np.zeros((len(plain.p), n_z + n_m, n_z + n_m))
-    p[:, :n_z, :n_z] = plain.p
-    p[:, n_z:, :n_z] = multiply(keeping[..., n_m:], plain.s)
-    p[:, n_z:, n_z:] = keeping[..., :n_m]
-    q = np.concatenate([plain.q, multiply(keeping[..., n_m:], plain.d)], axis=-2)
-    s = np.concatenate([multiply(listed[..., n_m:], plain.s), listed[..., :n_m]], axis=-1)
-    d = multiply(listed[..., n_m:], plain.d)
+    n_z, multiply = frame_map.p.shape[-1], arithmetic_of(frame_map.p).multiply
+    p = np.zeros((len(frame_map.p), n_z + n_m, n_z + n_m))
+    p[:, :n_z, :n_z] = frame_map.p
+    p[:, n_z:, :n_z] = multiply(stored_rows[..., n_m:], frame_map.s)
+    p[:, n_z:, n_z:] = stored_rows[..., :n_m]
+    q = np.concatenate([frame_map.q, multiply(stored_rows[..., n_m:], frame_map.d)], axis=-2)
+    s = np.concatenate([multiply(output_rows[..., n_m:], frame_map.s), output_rows[..., :n_m]], axis=-1)
+    d = multiply(output_rows[..., n_m:], frame_map.d)
     sent: dict[SentSample, int] = {sent: count + row for sent, row in row_of.items()}
     return MeanSubsystem(FrameMap(p, q, s, d), values, reception_errors, sent)
 
@@ -250,11 +249,11 @@ def mean_loop(
     loop: ModalSystem,
     received: Sequence[Sequence[UncertainSample]],
     memory: Sequence[RouteMemory],
-    listened: Sequence[Listened],
+    received_channels: Sequence[ReceivedChannel],
     neutral: Floats,
     frames: Mapping[str, FrameMap] | None = None,
 ) -> MeanLoop:
-    """Close a loop of mean dynamics, with the effect of the noise of some channels.
+    """Return the closed loop of mean dynamics, with the effect of the noise of some channels.
 
     Parameters
     ----------
@@ -264,111 +263,141 @@ def mean_loop(
         The received sample of each row of r of each subsystem.
     memory
         The receiver memory of each route.
-    listened
-        The channels.
+    received_channels
+        The received channels.
     neutral
         The rigid modes over the loop's z, subsystem after subsystem (Σ n_z, d).
     frames
         The subsystems' frame maps by name, if different from the loop's: over a cell of m parameters (2 + m,
         …), as are then all matrices.
     """
-    of_route = {item.route: item for item in memory}
+    memory_by_route = {item.route: item for item in memory}
     subsystems = [
         with_memory(group, memory, frames[group.name] if frames else None) for group in loop.subsystems
     ]
     offsets = np.cumsum([0] + [subsystem.states for subsystem in subsystems]).tolist()
     starts = np.cumsum([0] + [subsystem.map.s.shape[-2] for subsystem in subsystems]).tolist()
     layout = StateLayout(tuple(offsets[:-1]), ("",) * offsets[-1], {})
-    values = [of_route[item.route].memorized(of_route[item.route].after) for item in listened]
+    values = [
+        memory_by_route[item.route].of_all_channels(memory_by_route[item.route].after)
+        for item in received_channels
+    ]
     firsts = np.cumsum([offsets[-1]] + [value.shape[-1] for value in values]).tolist()
-    feedback, like, numbers = (
+    feedback, subsystem_map, numbers = (
         list[InterconnectionMatrices](),
         subsystems[0].map.p,
         arithmetic_of(subsystems[0].map.p),
     )
     for g, rows in enumerate(received):
-        now, before = (np.zeros((len(like), len(rows), many)) for many in (starts[-1], firsts[-1]))
-        for line, row in enumerate(rows):
-            item = of_route.get((row.coupling_term.link, row.coupling_term.delay))
+        direct, delayed = (
+            np.zeros((len(subsystem_map), len(rows), column_count))
+            for column_count in (starts[-1], firsts[-1])
+        )
+        for input_row, row in enumerate(rows):
+            item = memory_by_route.get((row.coupling_term.link, row.coupling_term.delay))
             if item is None or row.gap or row.channel not in item.channels:
                 continue  # a missing value is held, without substitution
             value = item.memory.received[row.clock, row.tick]
             for h, weight in enumerate(loop.coupling[row.coupling_term][g]):
                 if weight:
                     index = starts[h] + subsystems[h].values[item.route, row.channel, value]
-                    now[:2, line, index] = bounded_weight(
+                    direct[:2, input_row, index] = bounded_weight(
                         weight, loop.weight_errors.get(row.coupling_term, 0.0)
                     )
             index = item.channels.index(row.channel) * len(item.memory.old) + value
-            for channel, local, first in zip(listened, values, firsts, strict=False):
+            for channel, channel_values, first in zip(received_channels, values, firsts, strict=False):
                 if (
                     channel.subsystem == g
                     and channel.route == item.route
                     and channel.weights.get(row.coupling_term)
                 ):
-                    by = np.array(bounded_weight(channel.weights[row.coupling_term], 0.0)).reshape(2, 1, 1)
-                    weighed = entrywise(local[:, index, None], by)
-                    before[:, line, first : first + local.shape[-1]] = over_as_many(weighed, like)[:, 0]
-        feedback.append(InterconnectionMatrices(now, before))
+                    weight_ball = np.array(bounded_weight(channel.weights[row.coupling_term], 0.0)).reshape(
+                        2, 1, 1
+                    )
+                    weighed = entrywise(channel_values[:, index, None], weight_ball)
+                    delayed[:, input_row, first : first + channel_values.shape[-1]] = over_as_many(
+                        weighed, subsystem_map
+                    )[:, 0]
+        feedback.append(InterconnectionMatrices(direct, delayed))
     closed = interconnect([subsystem.map for subsystem in subsystems], feedback, layout, numbers=numbers)
-    at = relative_coordinates(neutral_state(closed.matrix[..., : offsets[-1]], neutral, loop, offsets))
-    rest, n = at.rest, len(at.rest)
-    moved = relative_rows(closed.matrix, with_uncertainty(at, numbers), numbers)
+    coordinates = relative_coordinates(
+        with_stored_values(closed.matrix[..., : offsets[-1]], neutral, loop, offsets)
+    )
+    remaining, n = coordinates.rest, len(coordinates.rest)
+    relative_matrix = relative_rows(closed.matrix, with_uncertainty(coordinates, numbers), numbers)
 
-    columns = np.concatenate([rest, np.arange(offsets[-1], firsts[-1])])
-    matrix = np.zeros((len(like), len(columns), len(columns)))
-    matrix[:, :n] = moved[..., columns]
+    columns = np.concatenate([remaining, np.arange(offsets[-1], firsts[-1])])
+    matrix = np.zeros((len(subsystem_map), len(columns), len(columns)))
+    matrix[:, :n] = relative_matrix[..., columns]
     channels, start = [], n
-    for listen, local in zip(listened, values, strict=True):
-        item = of_route[listen.route]
+    for received_channel, channel_values in zip(received_channels, values, strict=True):
+        item = memory_by_route[received_channel.route]
         count = len(item.memory.old)
         stored = [number * count + e for number in range(len(item.channels)) for e in item.memory.stored]
-        end = start + local.shape[-1]
-        matrix[:, start : start + len(stored), start:end] = over_as_many(local[:, stored], like)
+        end = start + channel_values.shape[-1]
+        matrix[:, start : start + len(stored), start:end] = over_as_many(
+            channel_values[:, stored], subsystem_map
+        )
         reception_errors = []
-        for miss in item.reception_errors:
-            memorized = item.memorized(miss)
-            wide = np.zeros((len(like), memorized.shape[-2], len(columns)))
-            wide[..., start:end] = over_as_many(memorized, like)
-            reception_errors.append(wide)
+        for reception_error in item.reception_errors:
+            of_all_channels = item.of_all_channels(reception_error)
+            error_rows = np.zeros((len(subsystem_map), of_all_channels.shape[-2], len(columns)))
+            error_rows[..., start:end] = over_as_many(of_all_channels, subsystem_map)
+            reception_errors.append(error_rows)
         channels.append(
             ReceptionChannel(
                 range(start, start + len(stored)), range(start + len(stored), end), tuple(reception_errors)
             )
         )
         start = end
-    missed = {
-        (h, *which): closed.sent[:, starts[h] + rows.start : starts[h] + rows.stop][..., columns]
+    sent_errors = {
+        (h, *route_and_slot): closed.sent[:, starts[h] + rows.start : starts[h] + rows.stop][..., columns]
         for h, subsystem in enumerate(subsystems)
-        for which, rows in subsystem.reception_errors.items()
+        for route_and_slot, rows in subsystem.reception_errors.items()
     }
-    return MeanLoop(matrix, tuple(channels), at, tuple(offsets), missed)
+    return MeanLoop(matrix, tuple(channels), coordinates, tuple(offsets), sent_errors)
 
 
-def neutral_state(matrix: Matrix, neutral: Floats, loop: ModalSystem, offsets: Sequence[int]) -> Floats:
-    """Return rigid modes with their stored values: a constant state is received as it is sent.
+def with_stored_values(matrix: Matrix, neutral: Floats, loop: ModalSystem, offsets: Sequence[int]) -> Floats:
+    """Return the rigid modes (n_z, m), extended by the stored values to all states of the matrix.
 
-    With rational weights the stored values are small fractions, determined from the matrix.
+    A rigid mode is constant, so its stored values s solve s = M_ss s + M_sz z. With rational weights they are
+    small fractions: the least-squares solution is rounded to fractions, which are verified with error bounds.
+
+    Parameters
+    ----------
+    matrix
+        The matrix of the mean loop, with its error radius.
+    neutral
+        The rigid modes over z.
+    loop, offsets
+        The modal system; the start of each subsystem in the state, and the number of states.
 
     Raises
     ------
     ApcError
-        E806 the entries of the frame map overflow floats.
+        E806 no fractions satisfy the equation within its error bounds, as entries overflow.
     """
-    local = [len(group.z_names) for group in loop.subsystems]
-    moving = np.concatenate([offset + np.arange(size) for offset, size in zip(offsets, local, strict=False)])
+    sizes = [len(group.z_names) for group in loop.subsystems]
+    state_indices = np.concatenate(
+        [offset + np.arange(size) for offset, size in zip(offsets, sizes, strict=False)]
+    )
     basis = np.zeros((offsets[-1], neutral.shape[1]))
-    basis[moving] = neutral
-    rest = np.delete(np.arange(offsets[-1]), moving)
-    if not neutral.shape[1] or not len(rest):
+    basis[state_indices] = neutral
+    stored_indices = np.delete(np.arange(offsets[-1]), state_indices)
+    if not neutral.shape[1] or not len(stored_indices):
         return basis
     value = value_of(matrix)
-    still, sent = np.eye(len(rest)) - value[np.ix_(rest, rest)], value[np.ix_(rest, moving)] @ neutral
-    held = np.linalg.lstsq(still, sent)[0]
+    stored_matrix, sent = (
+        np.eye(len(stored_indices)) - value[np.ix_(stored_indices, stored_indices)],
+        value[np.ix_(stored_indices, state_indices)] @ neutral,
+    )
+    stored_values = np.linalg.lstsq(stored_matrix, sent)[0]
     numbers = arithmetic_of(matrix)
     for finest in FINEST:
-        basis[rest] = [
-            [float(Fraction(item).limit_denominator(finest)) for item in row] for row in held.tolist()
+        basis[stored_indices] = [
+            [float(Fraction(item).limit_denominator(finest)) for item in row]
+            for row in stored_values.tolist()
         ]
         error_bound = hull(
             numbers.subtract(numbers.multiply(matrix, numbers.exact(basis)), numbers.exact(basis))

@@ -26,8 +26,8 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.frame.interval_arithmetic import UNIT_ROUNDOFF, value_of
-from apc.frame.taylor_models import arithmetic_of, entrywise
+from apc.lifting.interval_arithmetic import UNIT_ROUNDOFF, value_of
+from apc.lifting.taylor_models import arithmetic_of, entrywise
 from apc.network.channel import LATEST, PARETO_SHAPE, ChannelLaw
 
 Floats = NDArray[np.float64]
@@ -38,7 +38,7 @@ SAME_CHANCE = 1e-15
 # Roundings of a probability, relative to 1: those of its law's numbers and of erfc or a power.
 CHANCE_ROUNDINGS = 8
 
-# Of a quotient of times by a jitter, which is a float: the latest packets of a table arrive all at once.
+# The relative rounding of a quotient of times by a jitter, which is a float.
 ROUNDED = 4e-16
 
 
@@ -46,11 +46,11 @@ ROUNDED = 4e-16
 class ReceiverMemory:
     """The values in effect at ticks of this frame and of later ones; `old` and `chances` by value.
 
-    Value e after all packets of a frame was `old[e]` before it, one of `count` stored from earlier frames.
-    The packet of slot k replaces it with probability `chances[e, k]`, known within `uncertainties[e, k]` and
-    its rounding. Over a cell of m parameters it changes by `moves[:, e, k]` from the center to the upper side
-    of each, all probabilities in proportion. `received` is the index of the value in effect at a tick (clock,
-    index); `stored` are the indices of the values stored for the next frame, in order.
+    Value e after all packets of a frame is `old[e]` before the frame, one of `count` stored from earlier
+    frames. The packet of slot k replaces it with probability `chances[e, k]`, known within `uncertainties[e,
+    k]` and its rounding. Over a cell of m parameters it changes by `moves[:, e, k]` from the center to the
+    upper side of each, all probabilities in proportion. `received` is the index of the value in effect at a
+    tick (clock, index); `stored` are the indices of the values stored for the next frame, in order.
     """
 
     old: NDArray[np.intp]  # (n_e,)
@@ -71,38 +71,42 @@ class ReceiverMemory:
         return int(self.chances.shape[1])
 
     def uncertain(self, slot: int) -> NDArray[np.intp]:
-        """Return the values of which it is open whether a slot's packet takes their place."""
-        local = self.chances[:, slot]
-        return np.flatnonzero((local > 0) & (local < 1))
+        """Return the indices of the values that a slot's packet replaces with a probability between
+        0 and 1.
+        """
+        slot_chances = self.chances[:, slot]
+        return np.flatnonzero((slot_chances > 0) & (slot_chances < 1))
 
     def chance(self, slot: int) -> Floats:
-        """Return the chances (2 + m, n) of a slot's uncertain values, with their radii and over a cell."""
+        """Return the probabilities (2 + m, n) with which a slot's packet replaces its uncertain values."""
         index = self.uncertain(slot)
-        local, error_bound = (
+        chances, error_bound = (
             self.chances[index, slot],
             self.uncertainties[index, slot] + CHANCE_ROUNDINGS * UNIT_ROUNDOFF,
         )
-        return np.concatenate([np.stack([local, error_bound]), self.moves[:, index, slot]])
+        return np.concatenate([np.stack([chances, error_bound]), self.moves[:, index, slot]])
 
-    def spread(self, slot: int) -> Floats:
-        """Return the covariance (2 + m, n, n) of whether a slot's packet takes the place of uncertain values.
+    def replacement_covariance(self, slot: int) -> Floats:
+        """Return the covariance (2 + m, n, n) of a slot's packet replacing each of its uncertain values.
 
-        With its radius, and over a cell: min(π, ϖ) − π ϖ of two chances, which one is the smaller being the
-        same all over the cell.
+        The first entry is the value, the second its error radius, the others its changes over a cell of m
+        parameters. A packet that has arrived by an early tick has arrived by a later one: for probabilities π
+        and ϖ the covariance is min(π, ϖ) − π ϖ. The smaller probability is the same at all points of the
+        cell.
         """
-        chance = self.chance(slot)
-        rows, columns = chance[..., :, None], chance[..., None, :]
-        least = np.where(value_of(rows) <= value_of(columns), rows, columns)
-        return np.asarray(arithmetic_of(least).subtract(least, entrywise(rows, columns)))
+        probabilities = self.chance(slot)
+        rows, columns = probabilities[..., :, None], probabilities[..., None, :]
+        joint = np.where(value_of(rows) <= value_of(columns), rows, columns)
+        return np.asarray(arithmetic_of(joint).subtract(joint, entrywise(rows, columns)))
 
 
 def is_memoryless(law: ChannelLaw) -> bool:
-    """Return whether packet losses are independent."""
+    """Return whether the packet losses of a channel are independent."""
     return abs(law.p + law.r - 1) <= SAME_CHANCE or law.one_minus_h == law.one_minus_k or law.p == 0
 
 
 def arrives(law: ChannelLaw, delay: Fraction, elapsed: Fraction, *, strictly: bool = False) -> float:
-    """Return the probability that a packet has arrived `elapsed` seconds after it was sent.
+    """Return the probability that a packet has arrived `elapsed` seconds after its sending.
 
     Parameters
     ----------
@@ -111,18 +115,18 @@ def arrives(law: ChannelLaw, delay: Fraction, elapsed: Fraction, *, strictly: bo
     delay
         The nominal delay in seconds, exact.
     elapsed
-        Seconds since it was sent.
+        Seconds since the packet was sent.
     strictly
         Whether a simultaneous arrival counts as not arrived.
     """
-    stored = 1 - law.mean_loss
+    most = 1 - law.mean_loss
     if elapsed < 0 or (strictly and elapsed == 0):
         return 0.0
     if not law.jitter:
-        return stored if elapsed > delay or (elapsed == delay and not strictly) else 0.0
+        return most if elapsed > delay or (elapsed == delay and not strictly) else 0.0
     late = float((elapsed - delay) / Fraction(law.jitter))
     if late >= LATEST[law.distribution] * (1 - ROUNDED):
-        return stored
+        return most
     match law.distribution:
         case "uniform":
             share = (late + 1) / 2
@@ -132,7 +136,7 @@ def arrives(law: ChannelLaw, delay: Fraction, elapsed: Fraction, *, strictly: bo
             offset = PARETO_SHAPE / (PARETO_SHAPE - 1)
             tail = late * 3 / 4 + offset  # as `channel.deviates`, turned around
             share = 1 - tail**-PARETO_SHAPE if tail > 1 else 0.0
-    return stored * min(max(share, 0.0), 1.0)
+    return most * min(max(share, 0.0), 1.0)
 
 
 def memory_of(
@@ -162,17 +166,17 @@ def memory_of(
         to the upper side of each.
     """
     assert law.trace is None, "recorded delays leave nothing to chance"
-    ahead = math.ceil(max(Fraction(law.longest), delay) / frame) + 2
+    frames_ahead = math.ceil(max(Fraction(law.longest), delay) / frame) + 2
     unit = math.lcm(*(number.denominator for number in (frame, *sent, *ticks.values())))
     length, starts = int(frame * unit), [int(number * unit) for number in reversed(sent)]
     chance: dict[int, float] = {}
 
-    def described(time: int) -> tuple[float, ...]:
+    def probabilities(time: int) -> tuple[float, ...]:
         """Return the probability that a tick has received each packet, newest first, of all frames."""
         values = []
-        for back in range(ahead + 1):
+        for frames_back in range(frames_ahead + 1):
             for start in starts:
-                elapsed = time - start + back * length
+                elapsed = time - start + frames_back * length
                 if elapsed not in chance:
                     chance[elapsed] = arrives(law, delay, Fraction(elapsed, unit), strictly=strictly)
                 values.append(chance[elapsed])
@@ -180,21 +184,23 @@ def memory_of(
 
     slots, instants = len(sent), sorted({int(tick * unit) for tick in ticks.values()})
     keys: dict[tuple[float, ...], int] = {}
-    of_time: dict[int, int] = {}
+    index_by_time: dict[int, int] = {}
     later: list[int] = []
-    for number in range(ahead + 1):
+    for number in range(frames_ahead + 1):
         for time in instants:
-            index = keys.setdefault(described(time + number * length), len(keys))
+            index = keys.setdefault(probabilities(time + number * length), len(keys))
             if number:
                 later.append(index)
             else:
-                of_time[time] = index
+                index_by_time[time] = index
     numbers = list(dict.fromkeys(later))
-    # A value kept is called by what is known of it a frame later: of no packet of that frame yet.
-    listed = list(keys)
-    known = {listed[index][: len(listed[index]) - slots]: number for number, index in enumerate(numbers)}
-    old = [known[key[slots:]] for key in listed]
-    chances = np.array([key[:slots][::-1] for key in listed])
+    # A stored value is identified by the probabilities of all packets except those of the next frame.
+    histories = list(keys)
+    number_by_history = {
+        histories[index][: len(histories[index]) - slots]: number for number, index in enumerate(numbers)
+    }
+    old = [number_by_history[key[slots:]] for key in histories]
+    chances = np.array([key[:slots][::-1] for key in histories])
     uncertainty, *moves = (value / (1 - law.mean_loss) if value else 0.0 for value in lost)
     return ReceiverMemory(
         old=np.array(old, np.intp),
@@ -202,6 +208,6 @@ def memory_of(
         uncertainties=chances
         * (uncertainty * (1 + 8 * UNIT_ROUNDOFF) + 4 * UNIT_ROUNDOFF * sum(map(abs, moves))),
         moves=np.array([chances * -move for move in moves]).reshape(len(moves), *chances.shape),
-        received={tick: of_time[int(time * unit)] for tick, time in ticks.items()},
+        received={tick: index_by_time[int(time * unit)] for tick, time in ticks.items()},
         stored=np.array(numbers, np.intp),
     )

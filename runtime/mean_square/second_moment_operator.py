@@ -1,8 +1,8 @@
-"""The second-moment map of a frame under random channel noise: its spectral radius, enclosed and proved.
+"""The second-moment map of a frame under random channel noise, with proved bounds of its spectral radius.
 
 Takes: state matrices, noise input matrices, and the linear forms that generate the noise.
-Gives: `MomentBlock`, `Operator`; `Enclosed`, `enclosed`, `dies_out`, `settled`; `stein`; `mean_of`,
-`number_of`; `congruence`.
+Gives: `MomentBlock`, `Operator`; `GrowthBounds`, `enclose_growth`, `proves_decay`,
+`stationary_moments`; `stein`; `weighted_sum`, `rounded_number`; `congruence`.
 Guarantees: a radius between `low` and `high` for every operator within the radii of its matrices.
 Does not: build the matrices (see `class_moments` and `self_substitution`).
 
@@ -30,10 +30,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.eigen.enclosure import enclose_eigenvalues
-from apc.eigen.kyp_bounds import is_positive
-from apc.eigen.matrix_norms import balance
-from apc.frame.interval_arithmetic import (
+from apc.lifting.interval_arithmetic import (
     FLOATS,
     MIDPOINT_RADIUS,
     UNIT_ROUNDOFF,
@@ -43,8 +40,12 @@ from apc.frame.interval_arithmetic import (
     value_of,
     with_error_radius,
 )
-from apc.frame.taylor_models import arithmetic_of, corners, entrywise, over_as_many
-from apc.threads import load_pool
+from apc.lifting.taylor_models import arithmetic_of, corners, entrywise, over_as_many
+from apc.spectrum.eigenpairs import largest_magnitudes
+from apc.spectrum.enclosure import enclose_eigenvalues
+from apc.spectrum.kyp_bounds import is_positive
+from apc.spectrum.matrix_norms import balance
+from apc.support.threads import load_pool
 
 Floats = NDArray[np.float64]
 Matrix = NDArray[Any]
@@ -52,7 +53,7 @@ Matrix = NDArray[Any]
 # The relative remainder of a sum by doubling: far below rounding.
 LEFT = 1e-24
 
-# Doublings until a sum counts as endless, 2^60 frames; or where what is doubled has grown to this.
+# Doublings after which a sum counts as divergent, 2^60 frames, and the size of a power that does.
 DOUBLINGS, ENDLESS = 60, 1e100
 
 # The gain is evaluated at this relative distance above the growth of the means, where it has its pole. The
@@ -72,7 +73,7 @@ SHARES = (0.7, 0.3, 0.05, 0.0)
 # An upper bound on the relative error of eigenvalues of a symmetric matrix.
 UNCERTAINTY = 1e-12
 
-# Roundings of a weight: those of a probability, and of how many peers it counts for.
+# Roundings of a weight: those of a probability, and of the number of peers that it is multiplied by.
 WEIGHT_ROUNDINGS = 18
 
 
@@ -84,44 +85,44 @@ class MomentBlock:
     ----------
     matrix
         M (2, n, n).
-    into
-        B (e, 2, n, p) of the noise vectors `by` (e,) that enter.
-    by
-        The indices of these noise vectors.
-    seen
+    noise_inputs
+        B (e, 2, n, p), the input matrices of the noise vectors that drive the block.
+    noises
+        The indices (e,) of these noise vectors.
+    noise_forms
         L (k, 2, p, n), the linear forms that generate the noise.
     shares
         w, one row per noise vector and k columns.
-    at_once
-        The contribution of the noise `by` to these forms in the same frame (k, e, 2, p, p); None for none.
+    same_frame
+        The contribution of `noises` to these forms in the same frame (k, e, 2, p, p); None without any.
     """
 
     matrix: Matrix
-    into: Matrix
-    by: tuple[int, ...]
-    observed: Matrix
+    noise_inputs: Matrix
+    noises: tuple[int, ...]
+    noise_forms: Matrix
     shares: Floats
-    at_once: Matrix | None = None
+    same_frame: Matrix | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Operator:
-    """T: its blocks, and S, (2, p, p) per noise vector."""
+    """The map T: its blocks, and the noise covariances S, (2, p, p) per noise vector."""
 
     blocks: tuple[MomentBlock, ...]
     noise_covariance: Matrix
 
     @cached_property
     def floats(self) -> Operator:
-        """The same in floats, without radii."""
+        """The operator in floats, without radii."""
         blocks = [
             MomentBlock(
                 value_of(block.matrix),
-                value_of(block.into),
-                block.by,
-                value_of(block.observed),
+                value_of(block.noise_inputs),
+                block.noises,
+                value_of(block.noise_forms),
                 block.shares,
-                None if block.at_once is None else value_of(block.at_once),
+                None if block.same_frame is None else value_of(block.same_frame),
             )
             for block in self.blocks
         ]
@@ -129,25 +130,28 @@ class Operator:
 
     @cached_property
     def scales(self) -> list[Floats]:
-        """By which states (n,) of each block are of one size, powers of two."""
+        """The scaling of each block's states (n,), powers of two, that balances its matrices."""
         result = []
         for block in self.blocks:
             size = np.abs(value_of(block.matrix)) + spread_of(block.matrix)
-            if len(block.into) and len(block.observed):
-                into, observed = np.abs(value_of(block.into)), np.abs(value_of(block.observed))
-                size = size + into.sum(axis=0) @ observed.max(axis=0)
+            if len(block.noise_inputs) and len(block.noise_forms):
+                noise_inputs, noise_forms = (
+                    np.abs(value_of(block.noise_inputs)),
+                    np.abs(value_of(block.noise_forms)),
+                )
+                size = size + noise_inputs.sum(axis=0) @ noise_forms.max(axis=0)
             result.append(balance(size))
         return result
 
     @property
     def balanced(self) -> Operator:
-        """The same over states of one size."""
+        """The operator over states scaled by `scales`."""
         blocks = [
             replace(
                 block,
                 matrix=block.matrix / scale[:, None] * scale,
-                into=block.into / scale[:, None],
-                observed=block.observed * scale,
+                noise_inputs=block.noise_inputs / scale[:, None],
+                noise_forms=block.noise_forms * scale,
             )
             for block, scale in zip(self.blocks, self.scales, strict=True)
         ]
@@ -158,173 +162,195 @@ class Operator:
         """The number of states of each block."""
         return [block.matrix.shape[-1] for block in self.blocks]
 
-    def followed(self, moments: Sequence[Matrix | None], input_slots: Matrix, numbers: Arithmetic) -> Matrix:
-        """Return the part of V generated by moments, and by noise of the same frame; shape as V.
+    def generated_noise(
+        self, moments: Sequence[Matrix | None], noise_now: Matrix, numbers: Arithmetic
+    ) -> Matrix:
+        """Return the covariances V generated by the moments, and by noise of the same frame; shape as V.
 
         In floats, for stacks of moments (…, n, n) and of V.
         """
-        result = input_slots * 0.0
+        result = noise_now * 0.0
         for block, moment in zip(self.blocks, moments, strict=True):
-            if moment is None or not len(block.observed):
+            if moment is None or not len(block.noise_forms):
                 continue
-            formed = congruence(block.observed, _each(moment, numbers), numbers)
-            for e, noise in enumerate(block.by if block.at_once is not None else ()):
-                assert block.at_once is not None
-                at_once = congruence(
-                    block.at_once[:, e], _each(_single(input_slots, noise, numbers), numbers), numbers
+            forms = congruence(block.noise_forms, _with_batch_axis(moment, numbers), numbers)
+            for e, noise_index in enumerate(block.noises if block.same_frame is not None else ()):
+                assert block.same_frame is not None
+                direct = congruence(
+                    block.same_frame[:, e],
+                    _with_batch_axis(_matrix_at(noise_now, noise_index, numbers), numbers),
+                    numbers,
                 )
-                formed = numbers.add(formed, at_once)
-            result = numbers.add(result, _weighted(block.shares, formed, numbers))
+                forms = numbers.add(forms, direct)
+            result = numbers.add(result, _weighted(block.shares, forms, numbers))
         return (
             np.multiply(result, self.noise_covariance)
             if numbers is FLOATS
             else entrywise(result, self.noise_covariance)
         )
 
-    def driven(self, noise: Matrix, numbers: Arithmetic) -> list[Matrix]:
-        """Return the contribution of the noise covariances V to each block (2, n, n)."""
+    def driven_moments(self, noise: Matrix, numbers: Arithmetic) -> list[Matrix]:
+        """Return the contribution of the noise covariances V to the moments of each block (2, n, n)."""
         result = []
         for block in self.blocks:
-            added = numbers.exact(np.zeros(block.matrix.shape[-2:]))
-            for into, number in zip(block.into, block.by, strict=True):
-                added = numbers.add(added, congruence(into, _single(noise, number, numbers), numbers))
-            result.append(added)
+            total = numbers.exact(np.zeros(block.matrix.shape[-2:]))
+            for noise_input, number in zip(block.noise_inputs, block.noises, strict=True):
+                total = numbers.add(
+                    total, congruence(noise_input, _matrix_at(noise, number, numbers), numbers)
+                )
+            result.append(total)
         return result
 
-    def moved(self, moments: Sequence[Matrix], numbers: Arithmetic) -> list[Matrix]:
-        """Return moments (2, n, n) of each block a frame later."""
-        noise = self.followed(moments, self.noise_covariance * 0.0, numbers)
-        for _ in self.noise_covariance if any(block.at_once is not None for block in self.blocks) else ():
-            noise = self.followed(moments, noise, numbers)
+    def next_moments(self, moments: Sequence[Matrix], numbers: Arithmetic) -> list[Matrix]:
+        """Return the moments (2, n, n) of each block one frame later."""
+        noise = self.generated_noise(moments, self.noise_covariance * 0.0, numbers)
+        for _ in self.noise_covariance if any(block.same_frame is not None for block in self.blocks) else ():
+            noise = self.generated_noise(moments, noise, numbers)
         pairs = zip(self.blocks, moments, strict=True)
         after = [congruence(block.matrix, moment, numbers) for block, moment in pairs]
-        return list(map(numbers.add, after, self.driven(noise, numbers)))
+        return list(map(numbers.add, after, self.driven_moments(noise, numbers)))
 
     @cached_property
     def means(self) -> float:
-        """The growth factor of squared means, in floats."""
+        """The growth factor of squared means per frame, in floats."""
         loops = [value_of(block.matrix) for block in self.blocks]
-        return max(float(np.abs(np.linalg.eigvals(loop)).max(initial=0.0)) ** 2 for loop in loops)
+        return max(float(largest_magnitudes(loop)) ** 2 for loop in loops)
 
-    def solution(self, added: Sequence[Floats], growth: float) -> list[Floats] | None:
-        """Return the X of μ X − T(X) = W in floats, None if the means grow by μ or more.
+    def solution(self, inputs: Sequence[Floats], growth: float) -> list[Floats] | None:
+        """Return the X of μ X − T(X) = W in floats; None if the means grow by μ or more per frame.
 
-        The steps are: moments from W without noise, the noise generated by them and itself, and X.
+        The steps are: moments from W without noise, the noise generated by these moments and by itself, and
+        X.
         """
-        of = self.floats
-        alone = [stein(block.matrix, item, growth) for block, item in zip(of.blocks, added, strict=True)]
+        operator = self.floats
+        without_noise = [
+            stein(block.matrix, item, growth) for block, item in zip(operator.blocks, inputs, strict=True)
+        ]
         gain = self.gain(growth)
-        if gain is None or any(item is None for item in alone):
+        if gain is None or any(item is None for item in without_noise):
             return None
-        nothing, upper = np.zeros(of.noise_covariance.shape), np.triu_indices(of.noise_covariance.shape[-1])
-        first = of.followed(alone, nothing, FLOATS)[..., *upper]
-        noise = np.zeros(of.noise_covariance.shape)
+        no_noise, upper = (
+            np.zeros(operator.noise_covariance.shape),
+            np.triu_indices(operator.noise_covariance.shape[-1]),
+        )
+        direct_noise = operator.generated_noise(without_noise, no_noise, FLOATS)[..., *upper]
+        noise = np.zeros(operator.noise_covariance.shape)
         try:
-            noise[..., *upper] = np.linalg.solve(np.eye(len(gain)) - gain, first.ravel()).reshape(first.shape)
+            noise[..., *upper] = np.linalg.solve(np.eye(len(gain)) - gain, direct_noise.ravel()).reshape(
+                direct_noise.shape
+            )
         except np.linalg.LinAlgError:
             return None
         noise += np.swapaxes(np.triu(noise, 1), -1, -2)
         result = [
-            stein(block.matrix, item + more, growth)
-            for block, item, more in zip(of.blocks, added, of.driven(noise, FLOATS), strict=True)
+            stein(block.matrix, item + noise_part, growth)
+            for block, item, noise_part in zip(
+                operator.blocks, inputs, operator.driven_moments(noise, FLOATS), strict=True
+            )
         ]
         return [item for item in result if item is not None]
 
     def gain(self, growth: float) -> Floats | None:
-        """Return the gain matrix from noise of growth μ to generated noise, entry by entry, in floats."""
-        of, columns = self.floats, list[Floats]()
-        count, p = of.noise_covariance.shape[0], of.noise_covariance.shape[-1]
+        """Return the gain matrix from noise that grows by μ per frame to generated noise, entry by entry, in
+        floats.
+        """
+        operator, columns = self.floats, list[Floats]()
+        count, p = operator.noise_covariance.shape[0], operator.noise_covariance.shape[-1]
         rows, indices = np.triu_indices(p)
         units = np.zeros((len(rows), p, p))
         units[np.arange(len(rows)), rows, indices] = units[np.arange(len(rows)), indices, rows] = 1.0
         for noise in range(count):
-            input_slots = np.zeros((len(rows), count, p, p))
-            input_slots[:, noise] = units
+            noise_now = np.zeros((len(rows), count, p, p))
+            noise_now[:, noise] = units
             moments = list[Floats | None]()
-            for block in of.blocks:
-                item = None
-                if noise in block.by:
-                    driven = congruence(block.into[block.by.index(noise)], units, FLOATS)
-                    if (item := stein(block.matrix, driven, growth)) is None:
+            for block in operator.blocks:
+                moment = None
+                if noise in block.noises:
+                    source = congruence(block.noise_inputs[block.noises.index(noise)], units, FLOATS)
+                    if (moment := stein(block.matrix, source, growth)) is None:
                         return None
-                moments.append(item)
+                moments.append(moment)
             columns.append(
-                of.followed(moments, input_slots, FLOATS)[..., rows, indices].reshape(len(rows), -1)
+                operator.generated_noise(moments, noise_now, FLOATS)[..., rows, indices].reshape(
+                    len(rows), -1
+                )
             )
         return np.concatenate(columns).T if columns else np.zeros((0, 0))
 
 
 @dataclass(frozen=True, slots=True)
-class Enclosed:
-    """The spectral radius of second moments a frame, and bounds on it; infinite where there is none."""
+class GrowthBounds:
+    """The growth factor of second moments per frame, and bounds on it; `high` is infinite without a bound."""
 
     radius: float
     low: float
     high: float
 
 
-def enclosed(of: Operator, *, bounded: bool = True) -> Enclosed:
-    """Enclose the growth factor of second moments per frame, for all start states.
+def enclose_growth(operator: Operator, *, bounded: bool = True) -> GrowthBounds:
+    """Return the growth factor of second moments per frame for all start states, with bounds.
 
     Parameters
     ----------
-    of
-        Their dynamics.
+    operator
+        The second-moment map.
     bounded
-        Whether bounds are asked for; without them, they are the radius itself.
+        Whether bounds are computed; otherwise both are the radius itself.
     """
-    of = of.balanced
-    if not np.isfinite(of.means):
-        return Enclosed(np.nan, 0.0, np.inf)
-    root = _root(of)
-    radius = max(of.means, root or 0.0)
+    operator = operator.balanced
+    if not np.isfinite(operator.means):
+        return GrowthBounds(np.nan, 0.0, np.inf)
+    root = _growth_by_noise(operator)
+    radius = max(operator.means, root or 0.0)
     if not bounded:
-        return Enclosed(radius, radius, radius)
+        return GrowthBounds(radius, radius, radius)
     low, high, width = None, None, FIRST_WIDTH
     if root is None:  # noise does not increase the growth of the means
         loops = (
-            enclose_eigenvalues(value_of(block.matrix), error_radius(block.matrix))[1] for block in of.blocks
+            enclose_eigenvalues(value_of(block.matrix), error_radius(block.matrix))[1]
+            for block in operator.blocks
         )
         low = max(loop.low for loop in loops) ** 2 * (1 - 2 * UNIT_ROUNDOFF)
     while width <= LAST_WIDTH and (low is None or high is None):
-        if high is None and _is_below(of, above := max(radius, NOTHING) * (1 + width)):
-            high = above
-        if low is None and _is_below(of, below := radius * (1 - width)) is False:
-            low = below
+        if high is None and _is_below(operator, upper := max(radius, NOTHING) * (1 + width)):
+            high = upper
+        if low is None and _is_below(operator, lower := radius * (1 - width)) is False:
+            low = lower
         width *= WIDER_BOUNDS
-    return Enclosed(radius, low or 0.0, np.inf if high is None else high)
+    return GrowthBounds(radius, low or 0.0, np.inf if high is None else high)
 
 
-def _root(of: Operator) -> float | None:
-    """Return the μ above the growth factor of means where the gain's largest eigenvalue is 1, or None.
+def _growth_by_noise(operator: Operator) -> float | None:
+    """Return the μ above the growth factor of means where the gain's largest eigenvalue ρ is 1.
 
-    The root is that of 1/ρ − 1, which is nearly straight from −1 at the means' own growth, where the gain has
-    its pole.
+    The result is None if ρ is below 1 for all such μ. The growth is computed as the root of 1/ρ − 1, which is
+    nearly a straight line from −1 at the growth factor of the means, where the gain has its pole.
     """
-    least = max(of.means, NOTHING)
+    least = max(operator.means, NOTHING)
 
-    def over(growth: float) -> float:
-        gain = of.gain(growth)
+    def deviation(growth: float) -> float:
+        """Return 1/ρ − 1 for the largest eigenvalue ρ of the gain."""
+        gain = operator.gain(growth)
         if gain is None or not np.isfinite(gain).all():
             return -1.0
-        return 1 / max(float(np.abs(np.linalg.eigvals(gain)).max(initial=0.0)), NOTHING) - 1
+        return 1 / max(float(largest_magnitudes(gain)), NOTHING) - 1
 
     low, gap = least * (1 + NEAR), max(1 - least, 0.1 * least)
-    if over(low) > 0:
+    if deviation(low) > 0:
         return None
-    while over(high := least + gap) < 0:
+    while deviation(high := least + gap) < 0:
         low, gap = high, WIDER * gap
-    return float(load_pool("scipy.optimize").brentq(over, low, high, xtol=1e-300, rtol=CLOSE))
+    return float(load_pool("scipy.optimize").brentq(deviation, low, high, xtol=1e-300, rtol=CLOSE))
 
 
-def _is_below(of: Operator, growth: float) -> bool | None:
-    """Return True if the spectral radius is proved to be below μ, False if proved not to be."""
-    moments = of.solution([np.eye(n) for n in of.sizes], growth)
+def _is_below(operator: Operator, growth: float) -> bool | None:
+    """Return True if the spectral radius is proved below μ, False if proved not below, None if undecided."""
+    moments = operator.solution([np.eye(n) for n in operator.sizes], growth)
     if moments is None:
         return None
     exact = [MIDPOINT_RADIUS.exact(moment) for moment in moments]
-    for moment, after in zip(exact, of.moved(exact, MIDPOINT_RADIUS), strict=True):
-        if not is_positive(MIDPOINT_RADIUS.subtract(entrywise(moment, number_of(growth)), after)):
+    for moment, after in zip(exact, operator.next_moments(exact, MIDPOINT_RADIUS), strict=True):
+        if not is_positive(MIDPOINT_RADIUS.subtract(entrywise(moment, rounded_number(growth)), after)):
             return None
     if all(map(is_positive, exact)):
         return True
@@ -332,44 +358,49 @@ def _is_below(of: Operator, growth: float) -> bool | None:
     return False if any(values.size and values[0] < -UNCERTAINTY for values in least) else None
 
 
-def dies_out(of: Operator) -> tuple[bool, bool]:
-    """Return whether decay of moments is proved, for all matrices within their radii or a cell.
+def proves_decay(operator: Operator) -> tuple[bool, bool]:
+    """Return whether decay of the moments is proved, for all matrices within their radii or over a cell.
 
-    The second value is whether they decay at the center, in floats.
+    The second value is whether the moments decay at the centre, in floats.
     """
-    of, inside = of.balanced, False
-    if not of.means < 1:
+    operator, decays_at_centre = operator.balanced, False
+    if not operator.means < 1:
         return False, False
-    numbers = arithmetic_of(of.blocks[0].matrix)
+    numbers = arithmetic_of(operator.blocks[0].matrix)
     for share in SHARES:
-        moments = of.solution([np.eye(n) for n in of.sizes], 1 - share * (1 - of.means))
+        moments = operator.solution([np.eye(n) for n in operator.sizes], 1 - share * (1 - operator.means))
         if moments is None or not all(is_positive(MIDPOINT_RADIUS.exact(moment)) for moment in moments):
             continue
-        inside = True
+        decays_at_centre = True
         exact = [numbers.exact(moment) for moment in moments]
-        left = map(numbers.subtract, exact, of.moved(exact, numbers))
-        if all(is_positive(corner) for matrix in left for corner in corners(matrix)):
+        decrease = map(numbers.subtract, exact, operator.next_moments(exact, numbers))
+        if all(is_positive(corner) for matrix in decrease for corner in corners(matrix)):
             return True, True
-    return False, inside
+    return False, decays_at_centre
 
 
-def settled(of: Operator, added: Sequence[Floats]) -> list[Floats]:
-    """Return the stationary moments for an input added to each block at the start of a frame (n, n)."""
-    scales, of = of.scales, of.balanced
-    start = [moment / np.outer(d, d) for moment, d in zip(added, scales, strict=True)]
-    result = of.solution(start, 1.0)
-    assert result is not None, "means grow, and second moments were to die out"
+def stationary_moments(operator: Operator, inputs: Sequence[Floats]) -> list[Floats]:
+    """Return the stationary moments (n, n) of each block, for an input added at the start of each frame."""
+    scales, operator = operator.scales, operator.balanced
+    start = [moment / np.outer(d, d) for moment, d in zip(inputs, scales, strict=True)]
+    result = operator.solution(start, 1.0)
+    assert result is not None, "means grow although second moments decay"
     return [moment * np.outer(d, d) for moment, d in zip(result, scales, strict=True)]
 
 
-def stein(matrix: Floats, driven: Floats, growth: float = 1.0) -> Floats | None:
-    """Return the X of μ X − M X Mᵀ = B, of M (n, n) and symmetric B (…, n, n); None if M grows faster.
+def stein(matrix: Floats, source: Floats, growth: float = 1.0) -> Floats | None:
+    """Return the X of μ X − M X Mᵀ = B, of M (n, n) and symmetric B (…, n, n); None if ρ(M)² ≥ μ.
+
+    Parameters
+    ----------
+    matrix, source, growth
+        M, B and μ.
 
     Notes
     -----
     X = Σ_k M^k B M^kᵀ/μ^{k+1}, doubled (Smith, 1968): of 2j terms, the second half is M^j times the first.
     """
-    total, power = driven / growth, matrix / growth**0.5
+    total, power = source / growth, matrix / growth**0.5
     for _ in range(DOUBLINGS):
         total = total + power @ total @ power.T
         power = power @ power
@@ -386,34 +417,34 @@ def congruence(left: Matrix, inner: Matrix, numbers: Arithmetic) -> Matrix:
     return numbers.multiply(numbers.multiply(left, inner), np.swapaxes(left, -1, -2))
 
 
-def _each(matrix: Matrix, numbers: Arithmetic) -> Matrix:
-    """Return a matrix, or many, to be multiplied by each of several."""
+def _with_batch_axis(matrix: Matrix, numbers: Arithmetic) -> Matrix:
+    """Return matrices with an axis of length 1 for products with several matrices."""
     return np.expand_dims(matrix, -3 if numbers is FLOATS else -4)
 
 
-def _single(matrices: Matrix, index: int, numbers: Arithmetic) -> Matrix:
-    """Return one of several matrices."""
+def _matrix_at(matrices: Matrix, index: int, numbers: Arithmetic) -> Matrix:
+    """Return the matrix of an index in a stack."""
     return np.asarray(np.take(matrices, index, axis=-3 if numbers is FLOATS else -4))
 
 
 def _weighted(weights: Floats, blocks: Matrix, numbers: Arithmetic) -> Matrix:
-    """Return Σ_k w_lk X_k (l, …) of matrices X (k, …), the weights w (l, k) rounded."""
-    turned, rows = blocks if numbers is FLOATS else np.moveaxis(blocks, -4, -3), weights
-    *many, count, n, m = turned.shape
-    flat = turned.reshape(*many, count, n * m)
+    """Return Σ_k w_lk X_k (l, …) of matrices X (k, …), with the rounding of the weights w (l, k)."""
+    stack, rows = blocks if numbers is FLOATS else np.moveaxis(blocks, -4, -3), weights
+    *batch_shape, count, n, m = stack.shape
+    flat = stack.reshape(*batch_shape, count, n * m)
     if numbers is not FLOATS:
         rows = over_as_many(
             with_error_radius(weights, WEIGHT_ROUNDINGS * UNIT_ROUNDOFF * np.abs(weights)), flat
         )
-    result = numbers.multiply(rows, flat).reshape(*many, len(weights), n, m)
+    result = numbers.multiply(rows, flat).reshape(*batch_shape, len(weights), n, m)
     return np.asarray(result if numbers is FLOATS else np.moveaxis(result, -3, -4))
 
 
-def mean_of(weights: Floats, blocks: Matrix) -> Matrix:
-    """Return Σ_k w_k X_k of matrices X (k, 2, n, m), the weights w (k,) rounded."""
+def weighted_sum(weights: Floats, blocks: Matrix) -> Matrix:
+    """Return Σ_k w_k X_k of matrices X (k, 2, n, m), with the rounding of the weights w (k,)."""
     return np.asarray(_weighted(weights[None], blocks, MIDPOINT_RADIUS)[0])
 
 
-def number_of(value: float) -> Matrix:
-    """Return a number that was rounded a few times, with its radius, to scale by."""
+def rounded_number(value: float) -> Matrix:
+    """Return a number with the radius of a few roundings, as a matrix (2, 1, 1)."""
     return np.array([value, 4 * UNIT_ROUNDOFF * abs(value)]).reshape(2, 1, 1)

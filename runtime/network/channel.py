@@ -47,13 +47,13 @@ PARETO_SHAPE = 3
 
 PARETO_MOST = 4.0
 
-# The largest numbers that `deviates` gives: of 53 random bits, a normal is never beyond √(2·53·ln 2) = 8.57.
+# The largest numbers of `deviates`: from 53 random bits, a normal number is never beyond √(2·53·ln 2) = 8.57.
 LATEST = {"uniform": 1.0, "normal": math.sqrt(2 * 53 * math.log(2)), "pareto": PARETO_MOST}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ChannelLaw:
-    """The numbers of a channel.
+    """The parameters of a channel.
 
     `p`, `r`, `one_minus_h` and `one_minus_k` are netem's `gemodel` (see `compiled.Loss`); `delay` and
     `jitter` are in seconds; `trace` (n,) replaces all of them: seconds, infinite for a lost packet.
@@ -75,21 +75,21 @@ class ChannelLaw:
 
     @property
     def mean_loss(self) -> float:
-        """The share of packets that get lost, in the long run."""
+        """The mean share of packets that get lost."""
         if self.trace is not None:
             return float(np.mean(np.isinf(self.trace)))
         return self.bad * self.one_minus_h + (1 - self.bad) * self.one_minus_k
 
     @property
     def longest(self) -> float:
-        """The longest delay that a packet which arrives can have, in seconds."""
+        """The longest delay of a packet that arrives, in seconds."""
         if self.trace is not None:
             return float(np.max(self.trace, initial=0.0, where=np.isfinite(self.trace)))
         return self.delay + self.jitter * LATEST[self.distribution]
 
 
 def channel_law(system: Model, link: Link, delay: Fraction) -> ChannelLaw:
-    """Return the numbers of a link's channel.
+    """Return the parameters of a link's channel, for the present values of the model.
 
     Parameters
     ----------
@@ -115,7 +115,7 @@ def channel_law(system: Model, link: Link, delay: Fraction) -> ChannelLaw:
     for group in system.groups:
         for parameter in group.values:
             if parameter.name in loss:
-                message = f"{parameter.name} is of a link, the same for all peers: {group.name} can't set it"
+                message = f"{parameter.name} belongs to a link and can't be set by {group.name}"
                 raise ApcError(Diagnostic("E891", SourceLocation(system.origin.topology), message))
     value = {parameter.name: parameter.value for parameter in system.parameters}
     seconds = {timing.name: float(timing.value) for timing in system.timings}
@@ -126,31 +126,31 @@ def channel_law(system: Model, link: Link, delay: Fraction) -> ChannelLaw:
     )
 
 
-def deviates(distribution: str, values: Floats, two: Floats) -> Floats:
-    """Return random jitter values, relative to the jitter, from a distribution.
+def deviates(distribution: str, values: Floats, second_values: Floats) -> Floats:
+    """Return random numbers (n,) from the distribution of a jitter, in units of the jitter.
 
     Parameters
     ----------
     distribution
         "uniform": evenly from −1 to 1; "normal": of mean 0 and standard deviation 1; "pareto": netem's, from
         −2/3 to 4, many a little early and few very late, of mean −0.033 and standard deviation 0.821.
-    values, two
+    values, second_values
         Independent numbers (n,) from 0 to less than 1.
     """
     match distribution:
         case "uniform":
             return 2 * values - 1
         case "normal":  # Box and Muller (1958)
-            normal = np.sqrt(-2 * np.log1p(-values)) * np.cos(2 * np.pi * two)
+            normal = np.sqrt(-2 * np.log1p(-values)) * np.cos(2 * np.pi * second_values)
             return np.asarray(normal, dtype=np.float64)
     assert distribution == "pareto", f"no such distribution: {distribution}"
     tail = (1 - values) ** (-1 / PARETO_SHAPE)
-    late = (tail - PARETO_SHAPE / (PARETO_SHAPE - 1)) * 4 / 3
-    return np.asarray(np.minimum(late, PARETO_MOST), dtype=np.float64)
+    lateness = (tail - PARETO_SHAPE / (PARETO_SHAPE - 1)) * 4 / 3
+    return np.asarray(np.minimum(lateness, PARETO_MOST), dtype=np.float64)
 
 
 def stream_key(link: str, seed: int, run: int) -> tuple[int, int]:
-    """Return the random-stream key of a link: derived from its name, so that other links do not affect it."""
+    """Return the random-stream key of a link, derived from its name, so that other links do not affect it."""
     return seed, zlib.crc32(link.encode()) + (run << 32)
 
 
@@ -180,30 +180,35 @@ class PacketSource:
         self._drawn = np.empty((self.arcs, 0, BLOCK))  # random numbers drawn ahead, from packet `used` on
 
     def take(self, count: int) -> Floats:
-        """Return the delays (M, count) in seconds of the next packets, infinite for those that get lost."""
+        """Return the delays (M, count) in seconds of the next packets, infinite for lost packets."""
         law, first = self.law, self.used
         self.used += count
         if law.trace is not None:
             recorded = law.trace[np.arange(first, first + count) % law.trace.size]
             return np.broadcast_to(recorded, (self.arcs, count))
-        samples = self._drawn.shape[1]
-        if count > samples:
-            more = max(count - samples, min(AHEAD, MOST_AHEAD // max(self.arcs, 1)))
-            self._drawn = np.concatenate([self._drawn, self._uniforms(first + samples + 2, more)], axis=1)
+        stored = self._drawn.shape[1]
+        if count > stored:
+            drawn_count = max(count - stored, min(AHEAD, MOST_AHEAD // max(self.arcs, 1)))
+            self._drawn = np.concatenate(
+                [self._drawn, self._uniforms(first + stored + 2, drawn_count)], axis=1
+            )
         uniforms, self._drawn = self._drawn[:, :count], self._drawn[:, count:]
         bad = self._states(uniforms[..., 0])
         lost = uniforms[..., 1] < np.where(bad, law.one_minus_h, law.one_minus_k)
-        late = deviates(law.distribution, uniforms[..., 2], uniforms[..., 3]) if law.jitter else 0.0
-        # Nothing arrives before it was sent: as in netem, a delay that would be negative is none.
-        return np.where(lost, np.inf, np.maximum(law.delay + law.jitter * late, 0.0))
+        lateness = deviates(law.distribution, uniforms[..., 2], uniforms[..., 3]) if law.jitter else 0.0
+        # As in netem, a negative delay is replaced by 0.
+        return np.where(lost, np.inf, np.maximum(law.delay + law.jitter * lateness, 0.0))
 
     def _uniforms(self, first: int, count: int) -> Floats:
-        """Return `count` blocks per link (M, count, BLOCK) of numbers uniform on [0, 1) with 53 bits."""
+        """Return `count` blocks per directed link (M, count, BLOCK) of uniform numbers on [0, 1) with
+        53 bits.
+        """
         generator = np.random.Philox(key=np.array(self._key, np.uint64))
         state: Any = generator.state
         words = np.empty((self.arcs, count * BLOCK), np.uint64)
         for row, pair in zip(words, self._pairs, strict=True):
-            state["state"]["counter"] = np.array([first - 1, *pair, 0], np.uint64)  # it counts, then gives
+            # Philox increments the counter before each block.
+            state["state"]["counter"] = np.array([first - 1, *pair, 0], np.uint64)
             generator.state = state
             row[:] = generator.random_raw(count * BLOCK)
         indices = words.reshape(self.arcs, count, BLOCK)
@@ -218,10 +223,10 @@ class PacketSource:
         turns_bad, turns_good = uniforms < self.law.p, uniforms >= 1 - self.law.r
         steps = np.arange(1, uniforms.shape[1] + 1)
         constant = np.maximum.accumulate(np.where(turns_bad != turns_good, steps, 0), axis=1)
-        none = np.zeros((self.arcs, 1), np.int64)
-        exchanges = np.hstack([none, np.cumsum(turns_bad & turns_good, axis=1)])
+        no_exchange = np.zeros((self.arcs, 1), np.int64)
+        exchanges = np.hstack([no_exchange, np.cumsum(turns_bad & turns_good, axis=1)])
         first = np.take_along_axis(np.hstack([self._bad[:, None], turns_bad]), constant, axis=1)
-        since = exchanges[:, 1:] - np.take_along_axis(exchanges, constant, axis=1)
-        bad = np.hstack([self._bad[:, None], first ^ (since % 2 == 1)])
+        exchanges_since = exchanges[:, 1:] - np.take_along_axis(exchanges, constant, axis=1)
+        bad = np.hstack([self._bad[:, None], first ^ (exchanges_since % 2 == 1)])
         self._bad = bad[:, -1]
         return bad[:, :-1]

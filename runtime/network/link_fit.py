@@ -33,23 +33,23 @@ CONFIDENCE = 0.95
 # Losses are reported as dependent if independent losses would show the same dependence in less than one
 # recording in a thousand.
 CHANCE = 1e-3
-# Times the root of their number: how far packets drawn from a distribution are from it once in a thousand
-# times.
+# A Kolmogorov-Smirnov distance, times the square root of the number of packets, that packets of the same
+# distribution exceed once in a thousand recordings.
 MISFIT = 1.95
 # The shares of packets for which a delay quantile is reported; each requires this many later packets.
 QUANTILES = (0.5, 0.95, 0.99, 0.999)
 LATER = 5
 QUARTILES = (0.25, 0.5, 0.75)
-# Points at which the distribution of a jitter is put together: an error of its distance of 1/POINTS.
+# The number of samples of a jitter's distribution: the error of its distance is 1/POINTS.
 POINTS = 1 << 14
 
 
-NO_END = "no burst of losses ended within the recording: how long they last is not known"
+NO_END = "no loss burst ended within the recording; the burst length is unknown"
 
 
 @dataclass(frozen=True, slots=True)
 class Share:
-    """A share of `of` packets, and the `interval` that its probability lies in."""
+    """The share `count` of `of` packets, and the confidence `interval` of its probability."""
 
     count: int
     of: int
@@ -57,16 +57,16 @@ class Share:
 
     @property
     def value(self) -> float:
-        """The share, 0 of none."""
+        """The share, 0 if there are no packets."""
         return self.count / self.of if self.of else 0.0
 
 
 @dataclass(frozen=True, slots=True)
 class Law:
-    """The keys of a link, in seconds: `delay`, `jitter` (0 if there is none) and its `distribution`.
+    """The fitted delay and jitter of a link, in seconds: `delay`, `jitter` (0 without) and its
+    `distribution`.
 
-    `distance` is the largest difference between the shares of packets that it and the recording have below a
-    delay.
+    `distance` is the Kolmogorov-Smirnov distance between the distribution and the recorded delays.
     """
 
     delay: float
@@ -79,11 +79,11 @@ class Law:
 class LinkFit(Result):
     """Statistics of a packet recording; times in seconds.
 
-    `lost`, `p` (a lost packet follows one that arrived) and `r` are shares; `bursty` is
+    `lost`, `p` (a lost packet after one that arrived) and `r` (the reverse) are shares; `bursty` states
     whether losses cluster significantly, `bursts` and `longest_burst` count them. `quantiles` has pairs
     (share of packets, delay not exceeded); `correlation` is the lag-one autocorrelation of the delays (NaN
     with too few packets). `reordered` is the number of reordered packets, None with an unknown interval;
-    `delays` (n,) are all, infinite for a lost packet.
+    `delays` (n,) are the recorded delays, infinite for a lost packet.
     """
 
     shown_by: ClassVar[str] = "network_output:recording"
@@ -126,8 +126,8 @@ def fit_recording(path: str | Path, interval: float | None = None) -> LinkFit:
         E701 to E703, as for a link's `trace`.
     """
     trace = read_trace(Path(path), SourceLocation(str(path)))
-    between = trace.interval if interval is None else interval
-    return fit_delays(trace.delays, str(path), program=trace.program, interval=between)
+    sending_interval = trace.interval if interval is None else interval
+    return fit_delays(trace.delays, str(path), program=trace.program, interval=sending_interval)
 
 
 def fit_delays(delays: Floats, name: str, *, program: str = "", interval: float = math.nan) -> LinkFit:
@@ -142,24 +142,24 @@ def fit_delays(delays: Floats, name: str, *, program: str = "", interval: float 
     interval
         The sending interval in seconds, NaN if unknown.
     """
-    gone = np.isinf(delays)
-    arrived = delays[~gone]
-    after, before = gone[1:], gone[:-1]
-    p = _share(after & ~before, ~before)
-    r = _share(~after & before, before)
-    lost = _share(gone, np.ones_like(gone))
-    bursty = _follow(p, r) and r.count > 0
+    is_lost = np.isinf(delays)
+    arrived = delays[~is_lost]
+    after, before = is_lost[1:], is_lost[:-1]
+    p = _share_of(after & ~before, ~before)
+    r = _share_of(~after & before, before)
+    lost = _share_of(is_lost, np.ones_like(is_lost))
+    bursty = _is_bursty(p, r) and r.count > 0
     correlation = _correlation(delays)
-    law = _law(arrived)
-    runs = np.diff(np.flatnonzero(np.diff(np.concatenate([[False], gone, [False]]))))[::2]
+    fitted = _fitted_law(arrived)
+    runs = np.diff(np.flatnonzero(np.diff(np.concatenate([[False], is_lost, [False]]))))[::2]
     return LinkFit(
         file=name,
         program=program,
         packets=len(delays),
         interval=interval,
         limitations=(
-            *_limitations(program, len(delays), law, correlation, interval),
-            *([NO_END] if gone.any() and before.any() and not r.count else []),
+            *_limitations(program, len(delays), fitted, correlation, interval),
+            *([NO_END] if is_lost.any() and before.any() and not r.count else []),
         ),
         lost=lost,
         p=p,
@@ -175,8 +175,8 @@ def fit_delays(delays: Floats, name: str, *, program: str = "", interval: float 
             (share, _quantile(arrived, share)) for share in QUANTILES if len(arrived) * (1 - share) >= LATER
         ),
         correlation=correlation,
-        reordered=None if math.isnan(interval) else _overtaken(delays, interval),
-        distribution=law,
+        reordered=None if math.isnan(interval) else _reordered_count(delays, interval),
+        distribution=fitted,
         delays=delays,
     )
 
@@ -184,40 +184,39 @@ def fit_delays(delays: Floats, name: str, *, program: str = "", interval: float 
 def _limitations(
     program: str, packets: int, law: Law | None, correlation: float, between: float
 ) -> tuple[str, ...]:
-    """Return the properties that the link's keys omit or assume."""
+    """Return remarks on properties of the recording that the link's keys omit or assume."""
     remarks = [HALVED] if program else []
     if law is None:
-        return (*remarks, "every packet was lost: nothing is known of delays")
+        return (*remarks, "every packet was lost, so the delays are unknown")
     if correlation:
         remarks.append(
-            f"delays follow one another (correlation {correlation:.2f} from packet to packet), and a jitter "
-            "is drawn for each packet on its own; a trace has them as they were"
+            f"consecutive delays are correlated (coefficient {correlation:.2f}); jitter draws independent "
+            "delays, a trace reproduces the recorded ones"
         )
     if law.distance > MISFIT / math.sqrt(packets):
         remarks.append(
-            "delays are spread as none of the distributions that a jitter can have; a trace has them as they "
-            "were"
+            "the delays fit none of the distributions of jitter; a trace reproduces the recorded ones"
         )
     if not math.isnan(between):
         remarks.append(
-            f"a packet was recorded every {between * 1e3:.4g} ms: a link sends at its own clock, and a trace "
-            "gives it a row a packet, whatever time lay between them"
+            f"packets were recorded every {between * 1e3:.4g} ms; a trace has one row for each packet, at "
+            "any clock period of the link"
         )
     return tuple(remarks)
 
 
-def _share(these: NDArray[np.bool_], among: NDArray[np.bool_]) -> Share:
-    """Return a share with its interval."""
+def _share_of(selected: NDArray[np.bool_], among: NDArray[np.bool_]) -> Share:
+    """Return the share of packets with a property among some packets, with its confidence interval."""
     from scipy.stats import beta
 
-    count, of = int(these.sum()), int(among.sum())
-    rest = (1 - CONFIDENCE) / 2
-    low = float(beta.ppf(rest, count, of - count + 1)) if count else 0.0
-    high = float(beta.ppf(1 - rest, count + 1, of - count)) if count < of else 1.0
-    return Share(count, of, (low, high))
+    count, total = int(selected.sum()), int(among.sum())
+    tail = (1 - CONFIDENCE) / 2
+    low = float(beta.ppf(tail, count, total - count + 1)) if count else 0.0
+    high = float(beta.ppf(1 - tail, count + 1, total - count)) if count < total else 1.0
+    return Share(count, total, (low, high))
 
 
-def _follow(bad: Share, good: Share) -> bool:
+def _is_bursty(bad: Share, good: Share) -> bool:
     """Return whether losses cluster significantly (Fisher's exact test)."""
     from scipy.stats import fisher_exact
 
@@ -226,40 +225,41 @@ def _follow(bad: Share, good: Share) -> bool:
 
 
 def _correlation(delays: Floats) -> float:
-    """Return the correlation of consecutive delays; 0 where it is not significant."""
-    both = np.isfinite(delays[1:]) & np.isfinite(delays[:-1])
-    first, second = delays[:-1][both], delays[1:][both]
+    """Return the correlation of consecutive delays; 0 if it is not significant."""
+    both_arrived = np.isfinite(delays[1:]) & np.isfinite(delays[:-1])
+    first, second = delays[:-1][both_arrived], delays[1:][both_arrived]
     if len(first) < 10 or not first.std() or not second.std():
         return 0.0
     value = float(np.corrcoef(first, second)[0, 1])
-    # Of independent numbers it has the standard deviation 1/√n; 3.3 of these are left once in a thousand.
+    # The correlation of independent numbers has the standard deviation 1/√n, and exceeds 3.3/√n once in 1000.
     return value if abs(value) > 3.3 / math.sqrt(len(first)) else 0.0
 
 
 def _quantile(arrived: Floats, share: float) -> float:
+    """Return the smallest delay that a share of packets does not exceed."""
     return float(np.quantile(arrived, share, method="inverted_cdf"))
 
 
-def _overtaken(delays: Floats, interval: float) -> int:
-    """Return the number of reordered packets."""
+def _reordered_count(delays: Floats, interval: float) -> int:
+    """Return the number of packets that arrived after a packet sent later."""
     arrivals = np.arange(len(delays)) * interval + delays
     soonest_later = np.minimum.accumulate(arrivals[::-1])[::-1]
     return int(np.sum(np.isfinite(arrivals[:-1]) & (arrivals[:-1] > soonest_later[1:])))
 
 
-def _law(arrived: Floats) -> Law | None:
-    """Return the law of a jitter nearest to delays; None of none."""
+def _fitted_law(arrived: Floats) -> Law | None:
+    """Return the jitter law nearest to recorded delays; None without delays."""
     if not len(arrived):
         return None
     mean, deviation = float(arrived.mean()), float(arrived.std(ddof=1)) if len(arrived) > 1 else 0.0
     if deviation <= 1e-12 * mean:
         return Law(mean, 0.0, "uniform", 0.0)
     laws = []
-    # All pairs that a normal number is drawn from, and the same number twice for the others.
-    evenly = (np.arange(POINTS) + 0.5) / POINTS
+    # Evenly spaced uniform numbers, from which each distribution is computed.
+    uniforms = (np.arange(POINTS) + 0.5) / POINTS
     quartiles = [_quantile(arrived, share) for share in QUARTILES]
     for distribution in LATEST:
-        unit = _unit(distribution, evenly)
+        unit = _unit_samples(distribution, uniforms)
         low, middle, high = (_quantile(unit, share) for share in QUARTILES)
         if quartiles[2] > quartiles[0]:  # robust against a few very late packets
             jitter = (quartiles[2] - quartiles[0]) / (high - low)
@@ -268,22 +268,24 @@ def _law(arrived: Floats) -> Law | None:
             jitter = deviation / float(unit.std())
             delay = mean - jitter * float(unit.mean())
         if delay >= 0:
-            made = np.sort(np.maximum(delay + jitter * unit, 0.0))
-            laws.append(Law(delay, jitter, distribution, _distance(np.sort(arrived), made)))
+            samples = np.sort(np.maximum(delay + jitter * unit, 0.0))
+            laws.append(Law(delay, jitter, distribution, _distance(np.sort(arrived), samples)))
     return min(laws, key=lambda law: law.distance)
 
 
-def _unit(distribution: str, evenly: Floats) -> Floats:
-    """Return numbers spread as a distribution's are, rising or falling."""
+def _unit_samples(distribution: str, uniforms: Floats) -> Floats:
+    """Return samples of a distribution with unit jitter, from evenly spaced uniform numbers."""
     if distribution == "normal":
         from scipy.special import ndtri
 
-        return np.asarray(ndtri(evenly), dtype=np.float64)
-    return deviates(distribution, evenly, evenly)
+        return np.asarray(ndtri(uniforms), dtype=np.float64)
+    return deviates(distribution, uniforms, uniforms)
 
 
-def _distance(values: Floats, other: Floats) -> float:
-    """Return Kolmogorov and Smirnov's distance of two sorted samples."""
-    where = np.concatenate([values, other])
-    shares = [np.searchsorted(sample, where, side="right") / len(sample) for sample in (values, other)]
+def _distance(values: Floats, other_values: Floats) -> float:
+    """Return the Kolmogorov-Smirnov distance of two sorted samples."""
+    points = np.concatenate([values, other_values])
+    shares = [
+        np.searchsorted(sample, points, side="right") / len(sample) for sample in (values, other_values)
+    ]
     return float(np.abs(shares[0] - shares[1]).max())

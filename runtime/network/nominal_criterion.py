@@ -5,7 +5,7 @@ Gives: `unreliable`, `chance`, `limitations`, `refuse_range`, `channel_numbers`,
 Guarantees: a question about a number that only lost or late packets depend on is refused by name, as its
 answer would be about a network without them.
 Does not: answer for an unreliable network (see `mean_square`), or for all of a range (see
-`parameter_studies.delay_interval_proof`).
+`extensions.parameter_boxes.delay_interval_proof`).
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from fractions import Fraction
 
 from apc.compiler.compiled import Link, Model
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
-from apc.frame.parameter_names import ParameterRef, given_ranges, unit_of
-from apc.frame.parameters import resolve, scope_of
 from apc.network.channel import ChannelLaw, channel_law
+from apc.parameter_values.parameter_names import ParameterRef, given_ranges, unit_of
+from apc.parameter_values.parameters import resolve, scope_of
 
 
 def unreliable(system: Model) -> list[tuple[Link, ChannelLaw]]:
-    """Return the links that lose packets or delay them by chance, with their laws."""
+    """Return the links with random loss, jitter or recorded delays, with their channel laws."""
     links = [link for link in system.links if link.channel is not None]
     timings = resolve(system).timings if links else {}
     laws = [(link, channel_law(system, link, timings[link.delay])) for link in links]
@@ -29,7 +29,7 @@ def unreliable(system: Model) -> list[tuple[Link, ChannelLaw]]:
 
 
 def chance(link: Link, law: ChannelLaw) -> str:
-    """Return the channel of a link in words."""
+    """Return a description of a link's loss, jitter and recorded delays."""
     named = [f"packet loss ({100 * law.mean_loss:.3g} %)"] * bool(law.mean_loss)
     named += ["jitter"] * bool(law.jitter) + ["recorded delays"] * (law.trace is not None)
     return f"{' and '.join(named)} of {link.name}"
@@ -38,52 +38,57 @@ def chance(link: Link, law: ChannelLaw) -> str:
 def limitations(
     system: Model, *, network: bool = True, varied: Collection[ParameterRef] = ()
 ) -> tuple[str, ...]:
-    """Return the limitations for each unreliable link, and for each delay that is given as a range.
+    """Return a note on each unreliable link, and on each delay that is given as a range.
 
     Parameters
     ----------
     system
         The model.
     network
-        Whether the answer is of the nominal network.
+        Whether the result is that of the nominal network.
     varied
-        The varied timing: its range is not a limitation.
+        The varied timings; a range of these is not a limitation.
     """
     notes = []
     for link, law in unreliable(system) if network else ():
         delay = _ms(resolve(system).timings[link.delay])
-        notes.append(f"left out: {chance(link, law)}; here every packet takes the nominal {delay}")
-    names = {free.name for free in varied}
+        notes.append(f"excluded: {chance(link, law)}; every packet has the nominal delay of {delay}")
+    names = {parameter_ref.name for parameter_ref in varied}
     for interval in given_ranges(system):
         if interval.free.name not in names:
             low, middle, high = (
                 _ms(value) for value in (interval.low, (interval.low + interval.high) / 2, interval.high)
             )
-            notes.append(f"left out: {interval.free.label} from {low} to {high} but for its middle, {middle}")
+            notes.append(
+                f"excluded: the range {low} to {high} of {interval.free.label}; the midpoint {middle} is used"
+            )
     return tuple(notes)
 
 
 def refuse_range(system: Model) -> None:
-    """Refuse a model with a delay range where a fixed delay is required (simulate, export): ApcError E899."""
+    """Raise ApcError E899 for a delay given as a range where a single delay is required (simulate,
+    export).
+    """
     for interval in given_ranges(system):
         low, middle, high = (
             _ms(value) for value in (interval.low, (interval.low + interval.high) / 2, interval.high)
         )
-        message = f"{interval.free.label} is a range, {low} to {high}, of which this takes one"
-        hint = f'--set "{interval.free.label}={middle}"'
+        message = f"{interval.free.label} is a range, {low} to {high}; this command requires a single value"
+        fix = f'--set "{interval.free.label}={middle}"'
         axes = (axis for axis in system.within if axis.parameter == interval.free.name)
         line, column = next(((axis.line, axis.column) for axis in axes), (0, 0))
         raise ApcError(
-            Diagnostic("E899", SourceLocation(system.origin.topology, line, column), message, hint=hint)
+            Diagnostic("E899", SourceLocation(system.origin.topology, line, column), message, fix=fix)
         )
 
 
 def _ms(seconds: Fraction) -> str:
+    """Return a time as a text in ms."""
     return f"{float(seconds) * 1e3:.6g} ms"
 
 
 def channel_numbers(system: Model) -> frozenset[str]:
-    """Return the names of the losses and delays of links, and of all numbers that these depend on."""
+    """Return the names of the parameters of all channels, and of all numbers that these depend on."""
     texts: list[str] = []
     for link in system.links:
         if link.channel is not None and link.channel.loss is not None:
@@ -95,16 +100,16 @@ def channel_numbers(system: Model) -> frozenset[str]:
 
 
 def refuse_channel_number(
-    system: Model, free: ParameterRef, location: SourceLocation, *, instead: str = ""
+    system: Model, parameter_ref: ParameterRef, location: SourceLocation, *, instead: str = ""
 ) -> None:
-    """Refuse to vary a number of an unreliable link where every packet counts as on time.
+    """Raise an error for a varied parameter of a channel if the verdict is that of the nominal network.
 
     Parameters
     ----------
     system
         The model.
-    free
-        The timing to be varied.
+    parameter_ref
+        The parameter to be varied.
     location
         The location of the request.
     instead
@@ -113,13 +118,13 @@ def refuse_channel_number(
     Raises
     ------
     ApcError
-        E896 lost or late packets depend on it, and the verdict is of the nominal network.
+        E896 the parameter affects lost or late packets only.
     """
-    if free.name in channel_numbers(system):
+    if parameter_ref.name in channel_numbers(system):
         message = (
-            f"{free.label} can't be varied: this verdict is of the nominal network, in which no packet is "
-            "lost and all take their nominal delay"
+            f"{parameter_ref.label} has no effect on the nominal network, in which no packet is "
+            "lost and all delays are nominal"
         )
-        value = "2 ms" if unit_of(system, free.name) == "s" else "5 %"
-        hint = instead or f'apc simulate --set {free.label}="{value}"'
-        raise ApcError(Diagnostic("E896", location, message, hint=hint))
+        value = "2 ms" if unit_of(system, parameter_ref.name) == "s" else "5 %"
+        fix = instead or f'apc simulate --set {parameter_ref.label}="{value}"'
+        raise ApcError(Diagnostic("E896", location, message, fix=fix))

@@ -2,7 +2,7 @@
 
 Takes: a `Model` with its parameter values, the communication graph, the frame and the quantum of its
 schedules, a seed.
-Gives: `Route`, `routes_of`; `ArrivalProcess`, `arrival_process_of`; `Timetable`, `Listener`,
+Gives: `Route`, `routes_of`; `ArrivalProcess`, `arrival_process_of`; `Timetable`, `LinkReceiver`,
 `DeliveredPackets`, `START`; `instant_of`.
 Guarantees: without loss and jitter the packet in effect at a tick equals that of `scheduling`. All clocks of
 a receiver observe the same arrivals of a directed link. The result is independent of the partition of time
@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import Link, Model, PeerType
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
-from apc.frame.communication_graph import CommunicationGraph
-from apc.memory import refuse_beyond
 from apc.network.channel import ChannelLaw, PacketSource, channel_law
+from apc.support.memory import refuse_beyond
+from apc.timing.communication_graph import CommunicationGraph
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -53,9 +53,9 @@ class Route:
     """The samples received over one unreliable link at the ticks of one clock.
 
     `pairs` (M, 2) are the peers (sender, receiver), counted from 0, receiver by receiver, `weights` (M,) the
-    graph's; `longest` is the link's longest time in seconds from a packet's sample to its arrival. A frame
-    has `ticks` ticks of the clock and `slots` sending slots of the link; packets are stored for `frames`
-    frames. `zero` is whether the receiver substitutes its own value for a missing sample.
+    graph's weights; `longest` is the link's longest time in seconds from a packet's sample to its arrival. A
+    frame has `ticks` ticks of the clock and `slots` sending slots of the link; packets are stored for
+    `frames` frames. `zero` states whether the receiver substitutes its own value for a missing sample.
     """
 
     link: str
@@ -88,7 +88,7 @@ class ArrivalProcess:
 
     `law` is the channel law common to all directed links except for their `delays` (M,) in seconds; `nominal`
     (M,) are these delays in quanta. Packet k is sent at phase + k*period, tick k is at tick_phase +
-    k*tick_period. `newest` as in `Listener`.
+    k*tick_period. `newest` as in `LinkReceiver`.
     """
 
     law: ChannelLaw
@@ -102,11 +102,11 @@ class ArrivalProcess:
     newest: bool
 
     def stored(self, route: Route) -> int:
-        """Return a bound on the packets sent before the oldest is received or counted as lost."""
+        """Return an upper bound of the number of packets stored for each directed link."""
         return route.slots * (self.latest(route) // (route.ticks * self.tick_period) + 3)
 
     def latest(self, route: Route) -> int:
-        """Return the time in quanta within which a packet of a directed link has arrived or is lost."""
+        """Return the time in quanta after which a packet of a directed link has arrived or is lost."""
         return math.ceil(max(route.longest, float(self.delays.max(initial=0.0))) / float(self.quantum)) + 1
 
 
@@ -135,8 +135,8 @@ def arrival_process_of(
     Raises
     ------
     ApcError
-        E891 a group sets its own value for a link parameter; E892 too many packets in transit, or times too
-        long for so small a quantum.
+        E891 a group sets its own value for a link parameter; E892 too many packets in transit, or times
+        of too many quanta.
     """
     link = exchange.links[route.link]
     assert link.channel is not None
@@ -144,12 +144,12 @@ def arrival_process_of(
         clock.name: (timings[clock.phase] / quantum, timings[clock.period] / quantum)
         for clock in system.clocks
     }
-    groups, of_coupling_term = _groups(exchange, route.pairs)
-    late = [timings[exchange.delay(link.name, *pair)] for pair in groups]
+    groups, group_pair_of = _group_pairs(exchange, route.pairs)
+    group_delays = [timings[exchange.delay(link.name, *pair)] for pair in groups]
     arrival_process = ArrivalProcess(
         law=channel_law(system, link, timings[link.delay]),
-        delays=np.array([float(number) for number in late])[of_coupling_term],
-        nominal=np.array([int(number / quantum) for number in late], np.int64)[of_coupling_term],
+        delays=np.array([float(number) for number in group_delays])[group_pair_of],
+        nominal=np.array([int(number / quantum) for number in group_delays], np.int64)[group_pair_of],
         phase=int(grids[link.clock][0]),
         period=int(grids[link.clock][1]),
         tick_phase=int(grids[route.clock][0]),
@@ -162,30 +162,35 @@ def arrival_process_of(
 
 
 def _check_arrival_process(system: Model, route: Route, arrival_process: ArrivalProcess) -> None:
-    """Refuse a model with too many packets in transit, or with times of too many quanta."""
+    """Raise ApcError E892 for too many packets in transit, or for times of too many quanta."""
     latest, arcs = arrival_process.latest(route), len(route.pairs)
     if max(latest, route.ticks * arrival_process.tick_period) > LONGEST:
         message = (
-            f"{route.link} is unreliable, and all its times are counted in parts of "
+            f"{route.link} is unreliable; its times are multiples of "
             f"{float(arrival_process.quantum):.6g} s, of which periods, phases and delays are whole "
             "multiples: at most "
             f"{LONGEST} of them"
         )
         raise ApcError(
             Diagnostic(
-                "E892", SourceLocation(system.origin.topology), message, hint="periods and delays in whole µs"
+                "E892",
+                SourceLocation(system.origin.topology),
+                message,
+                advice="use periods and delays in whole µs",
             )
         )
     packets = arrival_process.stored(route) * arcs
-    message = f"{packets:,} packets kept on {arcs:,} ways of {route.link}, which is unreliable,"
-    hint = "a shorter delay or jitter, fewer peers, or graph: ring"
+    message = (
+        f"{packets:,} packets stored for {arcs:,} directed connections of the unreliable link {route.link}"
+    )
+    advice = "shorten the delay or jitter, reduce the number of peers, or use graph: ring"
     refuse_beyond(
-        ARC_BYTES * arcs + PACKET * packets, "E892", SourceLocation(system.origin.topology), message, hint
+        ARC_BYTES * arcs + PACKET * packets, "E892", SourceLocation(system.origin.topology), message, advice
     )
 
 
-class Listener:
-    """The samples received on a set of directed links at successive ticks; time only advances."""
+class LinkReceiver:
+    """The packets in effect on a set of directed links at successive ticks, in the order of time."""
 
     def __init__(
         self, source: PacketSource, *, phase: int, period: int, delay: int, quantum: Fraction, newest: bool
@@ -195,7 +200,7 @@ class Listener:
         Parameters
         ----------
         source
-            The packets.
+            The source of the packets.
         phase, period
             Packet k of every directed link is sent at phase + k*period, in quanta.
         delay
@@ -203,8 +208,8 @@ class Listener:
         quantum
             Seconds per quantum; all ticks are at integer multiples.
         newest
-            Whether the most recently sent packet is in effect. Otherwise the most recently arrived one is (of
-            simultaneous arrivals, the one sent last).
+            Whether the most recently sent packet is in effect; otherwise the most recently arrived packet (of
+            simultaneous arrivals, the packet sent last).
         """
         self.source = source
         self.phase = phase
@@ -213,7 +218,8 @@ class Listener:
         self.quantum = float(quantum)
         self.newest = newest
         self._effective = np.full(source.arcs, START, np.int64)
-        self._gap = np.full(source.arcs, START, np.int64)  # the newest lost packets that should be there
+        # The newest lost packets whose nominal arrival is past.
+        self._gap = np.full(source.arcs, START, np.int64)
         # Lost packets before their nominal arrival: directed link and packet number.
         self._due = np.zeros((2, 0), np.int64)
         # Packets in transit: directed link, number, first tick time of reception in quanta, fraction of a
@@ -222,61 +228,73 @@ class Listener:
 
     @property
     def stored(self) -> int:
-        """The number of packets that may still take effect or be found missing, on all directed links."""
+        """The number of packets in transit, or lost before their nominal arrival, on all directed links."""
         return self._in_flight.shape[1] + self._due.shape[1]
 
     def receive(self, ticks: Integers) -> DeliveredPackets:
-        """Return the packets in effect at the ticks (n,), in quanta, ascending, after all earlier ticks."""
+        """Return the packets in effect at the ticks (n,), in quanta, ascending, after the ticks of all
+        earlier calls.
+        """
         if not len(ticks):
-            nothing = (0, self.source.arcs)
-            return DeliveredPackets(np.zeros(nothing, np.int64), np.zeros(nothing, np.bool_))
+            empty_shape = (0, self.source.arcs)
+            return DeliveredPackets(np.zeros(empty_shape, np.int64), np.zeros(empty_shape, np.bool_))
         self._send_until(int(ticks[-1]))
-        arcs, numbers, observed, _ = self._in_flight
-        arrived = observed <= ticks[-1]
+        arcs, numbers, reception_times, _ = self._in_flight
+        arrived = reception_times <= ticks[-1]
         packets = self._in_effect(ticks, self._in_flight[:, arrived])
         missing = self._gaps(ticks) > packets
         self._effective = packets[-1].copy()
-        keep = ~arrived & (numbers > self._effective[arcs]) if self.newest else ~arrived
-        self._in_flight = self._in_flight[:, keep]
+        remaining = ~arrived & (numbers > self._effective[arcs]) if self.newest else ~arrived
+        self._in_flight = self._in_flight[:, remaining]
         return DeliveredPackets(packets, missing)
 
-    def _send_until(self, tick: int) -> None:
-        """Send the packets up to a time; later packets cannot have arrived."""
-        first = self.source.used
-        count = max((tick - self.phase) // self.period + 1 - first, 0)
+    def _send_until(self, until: int) -> None:
+        """Add all packets sent up to a time in quanta, with their delays drawn, to those lost or in transit.
+
+        Packets sent later have not arrived by then.
+        """
+        first_number = self.source.used
+        count = max((until - self.phase) // self.period + 1 - first_number, 0)
         delays = self.source.take(count) / self.quantum
-        lost = ~(delays < LONGEST)
-        fine = np.rint(np.where(lost, 0.0, delays) * FINENESS).astype(np.int64)
+        lost = ~(delays < LONGEST)  # infinite if lost
+        delay_parts = np.rint(np.where(lost, 0.0, delays) * FINENESS).astype(np.int64)
         arcs, numbers = np.indices(delays.shape)
-        numbers += first
-        observed = self.phase + self.period * numbers - (-fine // FINENESS)
-        before = -fine % FINENESS
-        sent = np.stack([arcs, numbers, observed, before])
+        numbers += first_number
+        # The delay rounded up to quanta, and by how much.
+        reception_times = self.phase + self.period * numbers - (-delay_parts // FINENESS)
+        part_before = -delay_parts % FINENESS
+        sent = np.stack([arcs, numbers, reception_times, part_before])
         self._due = np.concatenate([self._due, sent[:2, lost]], axis=1)
         self._in_flight = np.concatenate([self._in_flight, sent[:, ~lost]], axis=1)
 
     def _in_effect(self, ticks: Integers, arrived: Integers) -> Integers:
-        """Return the packets (n, M) sent last, or arrived last, of those that have arrived."""
-        arcs, numbers, observed, before = arrived
+        """Return, for each tick and directed link (n, M), the arrived packet that was sent last, or
+        arrived last.
+        """
+        arcs, numbers, reception_times, part_before = arrived
         if self.newest:
-            return _highest(ticks, arcs, observed, numbers, self._effective)
-        order = np.lexsort((numbers, -before, observed))
+            return _highest_rank(ticks, arcs, reception_times, numbers, self._effective)
+        order = np.lexsort((numbers, -part_before, reception_times))
         rank = np.arange(len(order))
-        latest = _highest(ticks, arcs[order], observed[order], rank, np.full(self.source.arcs, -1))
+        latest = _highest_rank(
+            ticks, arcs[order], reception_times[order], rank, np.full(self.source.arcs, -1)
+        )
         return np.where(latest < 0, self._effective, np.append(numbers[order], START)[latest])
 
     def _gaps(self, ticks: Integers) -> Integers:
-        """Return the newest lost packets (n, M) that should be there."""
+        """Return, for each tick and directed link (n, M), the newest lost packet whose nominal arrival
+        is past.
+        """
         arcs, numbers = self._due
-        when = self.phase + self.period * numbers + self.delay
-        due = when <= ticks[-1]
-        gaps = _highest(ticks, arcs[due], when[due], numbers[due], self._gap)
+        due_times = self.phase + self.period * numbers + self.delay
+        due = due_times <= ticks[-1]
+        gaps = _highest_rank(ticks, arcs[due], due_times[due], numbers[due], self._gap)
         self._due, self._gap = self._due[:, ~due], gaps[-1].copy()
         return gaps
 
 
 class Timetable:
-    """The packets of all unreliable links of a model, from time 0 on; time only goes forward."""
+    """The packets of all unreliable links of a model, from time 0 on, in the order of time."""
 
     def __init__(
         self,
@@ -296,39 +314,43 @@ class Timetable:
         seed, run
             The seed of the experiment and the index of the run.
         """
-        self.routes, self._noises = tuple(routes), tuple(arrival_processes)
-        self._listeners = [
-            _listen(route, arrival_process, seed, run)
+        self.routes, self._arrival_processes = tuple(routes), tuple(arrival_processes)
+        self._receivers = [
+            _link_receivers(route, arrival_process, seed, run)
             for route, arrival_process in zip(routes, arrival_processes, strict=True)
         ]
         self._now = 0
 
     def take(self, until: int) -> tuple[DeliveredPackets, ...]:
-        """Return the packets in effect at each route's ticks, from the last call until `until` in quanta."""
-        observed = []
-        for route, arrival_process, listeners in zip(self.routes, self._noises, self._listeners, strict=True):
+        """Return the packets in effect at each route's ticks, from the end of the last call to `until`, in
+        quanta.
+        """
+        delivered = []
+        for route, arrival_process, receivers in zip(
+            self.routes, self._arrival_processes, self._receivers, strict=True
+        ):
             phase, period = arrival_process.tick_phase, arrival_process.tick_period
             first = -(-(self._now - phase) // period)
             ticks = phase + period * np.arange(max(first, 0), -(-(until - phase) // period), dtype=np.int64)
             packets = np.empty((len(ticks), len(route.pairs)), np.int64)
             missing = np.empty(packets.shape, np.bool_)
-            for arcs, listener in listeners:
-                received = listener.receive(ticks)
+            for arcs, receiver in receivers:
+                received = receiver.receive(ticks)
                 packets[:, arcs], missing[:, arcs] = received.packets, received.missing
-            observed.append(DeliveredPackets(packets, missing))
+            delivered.append(DeliveredPackets(packets, missing))
         self._now = until
-        return tuple(observed)
+        return tuple(delivered)
 
 
-def _listen(
+def _link_receivers(
     route: Route, arrival_process: ArrivalProcess, seed: int, run: int
-) -> list[tuple[Integers, Listener]]:
-    """Return a listener per distinct delay of a route, with the indices of its directed links."""
+) -> list[tuple[Integers, LinkReceiver]]:
+    """Return a receiver for each distinct delay of a route, with the indices of its directed links."""
     pairs = []
     for nominal in np.unique(arrival_process.nominal).tolist():
         arcs = np.flatnonzero(arrival_process.nominal == nominal)
         law = replace(arrival_process.law, delay=float(arrival_process.delays[arcs[0]]))
-        listener = Listener(
+        receiver = LinkReceiver(
             PacketSource(law, route.link, route.pairs[arcs], seed=seed, run=run),
             phase=arrival_process.phase,
             period=arrival_process.period,
@@ -336,7 +358,7 @@ def _listen(
             quantum=arrival_process.quantum,
             newest=arrival_process.newest,
         )
-        pairs.append((arcs, listener))
+        pairs.append((arcs, receiver))
     return pairs
 
 
@@ -348,7 +370,7 @@ def routes_of(
     Parameters
     ----------
     system, timings, exchange
-        As in `arrival_process_of`.
+        As for `arrival_process_of`.
     frame_s
         The length of a frame in seconds.
 
@@ -369,17 +391,15 @@ def _routes_over(
     frame_s: Fraction,
     link: Link,
 ) -> list[Route]:
-    """Return a link's routes: the directed links grouped by the clock of their receivers."""
+    """Return the routes of a link: its directed links, grouped by the clock of their receivers."""
     peers, channel = exchange.peers, link.channel
     assert channel is not None, f"{link.name} is reliable"
     if link.graph.shape == "complete" and peers * (peers - 1) > MOST_ARCS:
         message = (
-            f"{link.name} is unreliable, and {peers} peers that all hear each other are "
-            f"{peers * (peers - 1)} ways with packets of their own; at most {MOST_ARCS} can be followed"
+            f"{link.name} is unreliable; {peers} completely connected peers have "
+            f"{peers * (peers - 1)} directed connections; the limit is {MOST_ARCS}"
         )
-        raise ApcError(
-            Diagnostic("E892", SourceLocation(system.origin.topology), message, hint="graph: ring")
-        )
+        raise ApcError(Diagnostic("E892", SourceLocation(system.origin.topology), message, fix="graph: ring"))
     peer_type_of = np.repeat([group.peer_type for group in system.groups], np.diff(exchange.starts))
     pairs, weights = exchange.arcs(link.name)
     order = np.lexsort((pairs[:, 0], pairs[:, 1]))  # receiver by receiver
@@ -393,7 +413,7 @@ def _routes_over(
         arcs = sends[peer_type_of[pairs[:, 0]]] & receives[peer_type_of[pairs[:, 1]]]
         if arcs.any():
             used[clock.name] = pairs[arcs], weights[arcs]
-    groups = {pair for some, _ in used.values() for pair in _groups(exchange, some)[0]}
+    groups = {pair for clock_pairs, _ in used.values() for pair in _group_pairs(exchange, clock_pairs)[0]}
     delays = {timings[exchange.delay(link.name, *pair)] for pair in groups}
     longest = max((channel_law(system, link, delay).longest for delay in delays), default=0.0)
     periods = {clock.name: timings[clock.period] for clock in system.clocks}
@@ -401,8 +421,8 @@ def _routes_over(
         Route(
             link=link.name,
             clock=clock,
-            pairs=some,
-            weights=local,
+            pairs=clock_pairs,
+            weights=clock_weights,
             longest=longest,
             ticks=int(frame_s / periods[clock]),
             slots=int(frame_s / periods[link.clock]),
@@ -410,31 +430,34 @@ def _routes_over(
             frames=math.ceil(longest / float(frame_s)) + 1,
             zero=channel.on_loss == "zero",
         )
-        for clock, (some, local) in used.items()
+        for clock, (clock_pairs, clock_weights) in used.items()
     ]
 
 
 def _receives(peer_type: PeerType, link: str, clock: str) -> bool:
-    ticking = [partition for partition in peer_type.clocks if partition.clock == clock]
-    return any(receive.link == link for partition in ticking for receive in partition.receives)
+    """Return whether a clock of a peer type receives over a link."""
+    partitions = [partition for partition in peer_type.clocks if partition.clock == clock]
+    return any(receive.link == link for partition in partitions for receive in partition.receives)
 
 
-def _groups(exchange: CommunicationGraph, pairs: Integers) -> tuple[list[tuple[int, int]], Integers]:
-    """Return the different pairs of groups of pairs of peers, and which of them each pair (M,) is."""
+def _group_pairs(exchange: CommunicationGraph, pairs: Integers) -> tuple[list[tuple[int, int]], Integers]:
+    """Return the distinct (sender, receiver) pairs of groups, and the index (M,) of each pair of peers."""
     groups = np.searchsorted(exchange.starts, pairs, side="right") - 1
     count = len(exchange.groups)
     distinct, of_pair = np.unique(groups[:, 0] * count + groups[:, 1], return_inverse=True)
     return [divmod(item, count) for item in distinct.tolist()], of_pair
 
 
-def _highest(ticks: Integers, arcs: Integers, when: Integers, ranks: Integers, first: Integers) -> Integers:
-    """Return, for each tick and directed link, the highest rank of the events up to that tick.
+def _highest_rank(
+    ticks: Integers, arcs: Integers, times: Integers, ranks: Integers, first: Integers
+) -> Integers:
+    """Return, for each tick and directed link (n, M), the highest rank of the events up to that tick.
 
     Parameters
     ----------
     ticks
         The ticks (n,), rising.
-    arcs, when, ranks
+    arcs, times, ranks
         The events (K,): the index among the M directed links, the time (not later than the last tick), the
         rank.
     first
@@ -442,5 +465,5 @@ def _highest(ticks: Integers, arcs: Integers, when: Integers, ranks: Integers, f
     """
     indices = np.full((len(ticks), len(first)), START, np.int64)
     indices[0] = first
-    np.maximum.at(indices.reshape(-1), np.searchsorted(ticks, when) * len(first) + arcs, ranks)
+    np.maximum.at(indices.reshape(-1), np.searchsorted(ticks, times) * len(first) + arcs, ranks)
     return np.maximum.accumulate(indices, axis=0)

@@ -2,7 +2,8 @@
 
 Takes: results of `analysis`, and the `AnalysisReport` they make together; a `Locus`.
 Gives: their texts and documents; `compile_text`; `analysis_picture`, the eigenvalues over the unit circle,
-and `locus_picture`, where they go; `warning_lines`, `changing_text`, `range_text`, `range_document`.
+and `locus_picture`, where they go; `warning_lines`, `changing_text`, `range_text`, `range_document`;
+`refusable_record`.
 Guarantees: every number that a verdict depends on has its error bound. A picture shows the unit circle, every
 eigenvalue and the critical ones. No text covers a mark, and the legend is outside the circle.
 Does not: compute, or need a display.
@@ -10,17 +11,17 @@ Does not: compute, or need a display.
 
 from __future__ import annotations
 
+import itertools
 import math
 import textwrap
 from collections.abc import Iterator, Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from apc.compiler.wording import counted, in_hertz, wrapped
-from apc.optional import need
 from apc.output.formatting import (
     LINEARIZED,
     NEAR,
@@ -28,6 +29,7 @@ from apc.output.formatting import (
     Plain,
     axis_label,
     document,
+    headed,
     labelled,
     listed,
     notes,
@@ -38,47 +40,52 @@ from apc.output.formatting import (
     sentences,
     table,
 )
+from apc.output.margins_output import margins_lines, sensitivities_lines
 from apc.output.pictures import COLOURS, legend_below, new_figure
+from apc.support.optional import need
 from apc.verdict import StabilityVerdict
 
 if TYPE_CHECKING:
     from apc.analysis.analysis import Analysis
-    from apc.analysis.arbitrary_switching import ArbitrarySwitching
-    from apc.analysis.contact_modes import ContactMode, ContactModes
-    from apc.analysis.event_order import EventOrder, Outcome
+    from apc.analysis.box_result import ChangingDelay, RobustStability
+    from apc.analysis.contact_modes import ContactModes
     from apc.analysis.model_size import ModelSize, SubsystemSize
-    from apc.analysis.paper_method import NamedMatrix, PaperMethod
-    from apc.analysis.robust_stability import ChangingDelay, RobustStability
     from apc.analysis_report import AnalysisReport, NetworkAnswer
     from apc.compiler.compiled import Model
-    from apc.eigen.spectrum import Mode
-    from apc.frame.parameter_names import Range
-    from apc.parameter_studies.root_locus import Locus
+    from apc.parameter_values.parameter_names import Range
+    from apc.spectrum.spectrum import Mode
+    from apc.studies.root_locus import Locus
 
-MOST_ROWS = 16
+MOST_ROWS = 5
+PACKETS = 2 / 3  # participation of packets in transit from which a mode is a transport-delay mode
 MORE_CELLS = 10  # times as many as left a box open, to try next
 DECIMALS = 6  # of a magnitude
 MOST_UNOBSERVABLE = 4  # names of excluded modes other than translations
 LEAST_MAGNITUDE = 1e-6  # its six digits would show as zero
 LARGE = 1e4  # a larger magnitude needs another notation to fit its column
 LEAST_SHARE = 0.005  # shows as zero
-HEADINGS = ("magnitude", "shape", "times", "frequency", "damping", "moves most")
+PAST = "(-"  # in the name of a state that is a past value, such as x(-1 ms)
+HEADINGS = ("|eigenvalue|", "type", "mult.", "frequency", "damping", "participation")
+MODES = "Modes (slowest first; a conjugate pair is one row)"
 
-NOT_SIMULATED = "not predicted and played: --limit-cycle"
+NOT_SIMULATED = "not predicted: --limit-cycle"
 SHOWN = 1e-9  # digits of a contact mode's spectral radius that its column has room for
 
 _WORDS = {
-    StabilityVerdict.STABLE: "Every motion dies out.",
+    StabilityVerdict.STABLE: "All motions decay.",
     StabilityVerdict.STABLE_TRANSLATING: (
-        "Nothing ties the peers to the ground; moved together they stay where they are.\n"
-        "Every other motion dies out."
+        "All motions decay except one: no element connects the peers to the ground, so a common translation "
+        "of all peers produces no force."
     ),
     StabilityVerdict.STABLE_TURNING: (
-        "Nothing holds the peers' angles; turned together they stay as they are.\n"
-        "Every other motion dies out."
+        "All motions decay except one: no element restrains the angles of the peers, so a common rotation of "
+        "all peers produces no torque."
     ),
-    StabilityVerdict.DRIFTS: "Nothing slows a common motion down. Every other motion dies out.",
-    StabilityVerdict.UNSTABLE: "Some motion grows until the devices shake or hit their limits.",
+    StabilityVerdict.DRIFTS: (
+        "All motions decay except common motions with a constant velocity, which no element damps or "
+        "restrains."
+    ),
+    StabilityVerdict.UNSTABLE: "At least one mode grows, until devices oscillate or reach their limits.",
 }
 
 SIZE = (5.6, 4.6)  # inches
@@ -97,16 +104,13 @@ def compile_text(system: Model, model_size: ModelSize, target: Path) -> Lines:
     target
         The file written.
     """
-    ticks = ", ".join(
-        f"{name} ticks {count} times" if count != 1 else f"{name} once" for name, count in model_size.ticks
-    )
+    ticks = " = ".join(f"{counted(count, f'{name} period')}" for name, count in model_size.ticks)
     yield f"{system.name} → {target}"
     yield from notes(str(replace(model_size, pairs=())))  # they follow, with their reason
-    yield (
-        f"  frame {quantity(float(model_size.frame), 's')}: {ticks or 'no clock is used, any frame will do'}"
-    )
+    frame = f"frame {quantity(float(model_size.frame), 's')}"
+    yield from notes(f"{frame} = {ticks}" if ticks else f"{frame} (no clock is used)")
     yield from warning_lines(system.warnings)
-    dropped = (f"left out: {name}, as {reason}" for name, reason in system.dropped)
+    dropped = (f"omitted: {name}, as {reason}" for name, reason in system.dropped)
     yield from notes(*_pairwise(system), *dropped)
 
 
@@ -121,63 +125,89 @@ def _pairwise(system: Model) -> Iterator[str]:
     }
     for name, receive in result.items():
         why = (
-            f"what it runs over is not linear in what the others send over {receive.link}"
+            f"its argument is not linear in the values received over {receive.link}"
             if receive.edge is not None and receive.operator in ("sum", "mean")
-            else f"a {receive.operator} can't be taken apart into one number a peer"
+            else f"a {receive.operator} has no decomposition into one number for each peer"
         )
-        yield f"costs N²: {name} is evaluated once a pair of peers, as {why}"
+        yield f"quadratic cost: {name} is evaluated for each pair of peers, as {why}"
 
 
 def analysis_text(result: Analysis) -> Lines:
-    """Yield the output of `apc analyze`: the verdict in words, the numbers, the modes as a table."""
-    words = _WORDS.get(result.verdict, "The spectral radius lies nearer to 1 than its error bound.")
+    """Yield the output of `apc analyze` without further results: verdict, summary, modes."""
+    yield from _summary(result)
+    yield from headed(MODES, _mode_table(result.modes))
+    if result.notes:
+        yield ""
+        yield from notes(*result.notes)
+
+
+def _summary(result: Analysis, warnings: Sequence[str] = ()) -> Lines:
+    """Yield the verdict of an analysis as a sentence, and its numbers.
+
+    Parameters
+    ----------
+    result
+        The analysis.
+    warnings
+        Those of the topology, printed below the verdict.
+    """
+    from apc.analysis.analysis import SETTLED  # a result has loaded it
+
+    words = _WORDS.get(result.verdict, "The spectral radius is closer to 1 than its error bound.")
     named = (("translation", result.translations), ("rotation", result.rotations))
-    free = " and ".join(counted(count, noun) for noun, count in named if count)
+    neutral_text = " and ".join(counted(count, noun) for noun, count in named if count)
+    excluded = neutral_text if result.rigid_modes > 1 else neutral_text.removeprefix("1 ")
     if result.translations + result.rotations > 1 and result.verdict.up_to_rigid_modes:
-        words = (
-            f"{free} are held back by nothing, of all peers together or of some beside others: moved so, "
-            "they stay where they are. Every other motion dies out."
-        )
+        words = f"All motions decay except {neutral_text} of all or some peers, which no element restrains."
     if result.linearized:
         words = f"To first order, {words[0].lower()}{words[1:]}"
     if result.linearized and result.stable is not True:
-        words += "\nWhat it does in time is played: apc simulate"
+        words += " For the motion over time, run: apc simulate"
     if not result.states_per_peer:
-        words = "Nothing here is free to move."
+        words = "The topology has no free motion."
     yield from wrapped(
         f"{result.topology}: {result.verdict}{LINEARIZED if result.linearized else ''}", "", "  "
     )
+    yield from warning_lines(warnings)
     yield from notes(*result.limitations)
     yield ""
-    yield from sentences(*words.splitlines())
+    yield from sentences(words)
     yield ""
     radius = radius_text(result.spectral_radius, result.spectral_radius_error, result.radius_excess)
-    unobservable = (
-        f"{listed(result.unobservable, MOST_UNOBSERVABLE)}, which nothing that moves reads at these values"
+    unobservable = f"{listed(result.unobservable, MOST_UNOBSERVABLE)}: not used by any motion at these values"
+    states = (
+        f"{result.states_per_peer} states each" if result.peers > 1 else f"{result.states_per_peer} states"
     )
+    rows = [("spectral radius", f"{radius} per frame of {quantity(result.frame_s, 's')} (stable < 1)")]
+    if result.modes and _is_alive(dominant := result.modes[0]):
+        known = not math.isnan(dominant.frequency_hz)
+        turns = in_hertz(dominant.frequency_hz) if known else "frequency undetermined"
+        turns = turns if dominant.frequency_hz else "real"
+        ratio = "" if math.isnan(dominant.damping_ratio) else f", damping ratio {dominant.damping_ratio:.3g}"
+        rows.append(("dominant mode", f"{dominant.family}, {turns}{ratio}"))
+    if result.settling_s:
+        rows.append(("settling time", f"{quantity(result.settling_s, 's', 3)} (to {100 * SETTLED:g} %)"))
     yield from labelled(
-        ("spectral radius", f"{radius} per frame of {quantity(result.frame_s, 's')}"),
-        ("peers", f"{result.peers}, {result.states_per_peer} states each"),
-        ("method", result.method + (f", {free} left out" if free else "")),
+        *rows,
+        (
+            "excluded",
+            f"{counted(result.rigid_modes, 'rigid-body mode')} ({excluded})" if neutral_text else "",
+        ),
+        ("unobservable", unobservable if result.unobservable else ""),
+        ("model", f"{counted(result.peers, 'peer')}, {states}; method: {result.method}"),
         ("proof", str(result.proof)),
-        ("left out", unobservable if result.unobservable else ""),
     )
-    yield ""
-    yield from _side_table(result)
-    yield from _mode_table(result.modes)
-    yield from notes(*result.notes)
+    if result.sides:
+        yield from headed("Sides of the kinks at the initial state", _side_table(result))
 
 
 def _side_table(result: Analysis) -> Lines:
     """Yield the verdict of each side of the kinks at which peers start."""
-    if not result.sides:
-        return
     rows = [("spectral radius", "verdict", "side of the kink")]
     for side in result.sides:
         error = max(side.spectral_radius_error, SHOWN if abs(side.spectral_radius - 1) > NEAR else 0.0)
         rows.append((radius_text(side.spectral_radius, error, None), side.verdict, side.name))
     yield from table(rows, "<<<")
-    yield ""
 
 
 def analysis_document(result: Analysis) -> Plain:
@@ -192,36 +222,47 @@ def _mode_document(mode: Mode) -> Plain:
 
 
 def answer_text(answer: AnalysisReport) -> Lines:
-    """Yield the output of `apc analyze`: the analysis and its additional results."""
-    event_order, topology = answer.event_order, answer.analysis.topology
-    warned = f"Warning: {event_order.warning}" if event_order.warning else ""
-    nominal: tuple[object, ...] = (answer.analysis, answer.sensitivities, answer.margins)
+    """Yield the output of `apc analyze`: verdict, summary, margins, sensitivities, modes, other results."""
+    analysis = answer.analysis
+    order = f"Warning: {answer.order_warning}" if answer.order_warning else ""
+    warnings = answer.warnings
+    if answer.box is not None:
+        yield str(answer.box)
+        yield from warning_lines(warnings)
+        yield ""
+        warnings = ()
+    if answer.network is not None:
+        yield from network_answer_lines(answer.network, warnings)
+        warnings = ()
+        yield ""
     if answer.network is not None and not answer.nominal:
-        nominal = (_in_short(answer.analysis),)
-    parts = (
-        answer.box,
-        answer.network,
-        *nominal,
-        answer.contact_modes,
-        answer.arbitrary_switching,
-        answer.limit_cycle,
-        "\n".join(wrapped(f"{topology}: {answer.no_limit_cycle}")) if answer.no_limit_cycle else "",
-        event_order if answer.detailed else "\n".join(wrapped(warned)),
-    )
-    first, _, rest = "\n\n".join(filter(None, map(str, filter(None, parts)))).partition("\n")
-    yield first
-    yield from warning_lines(answer.warnings)
-    yield rest
+        yield from _in_short(analysis)
+    else:
+        yield from _summary(analysis, warnings)
+        yield from margins_lines(answer.margins)
+        yield from sensitivities_lines(answer.sensitivities)
+        yield from headed(MODES, _mode_table(analysis.modes, everything=answer.all_modes))
+    for part in (answer.contact_modes, answer.arbitrary_switching, answer.limit_cycle):
+        if part is not None:
+            yield f"\n{part}"
+    if answer.no_limit_cycle:
+        yield from ("", *wrapped(f"Limit cycle: {answer.no_limit_cycle}"))
+    if answer.event_order is not None:
+        yield f"\n{answer.event_order}"
+    texts = (*(() if answer.network is not None and not answer.nominal else analysis.notes), order)
+    if any(texts):
+        yield ""
+        yield from notes(*texts)
 
 
-def _in_short(analysis: Analysis) -> str:
-    """Return the verdict of the nominal network, next to that of the lossy network."""
+def _in_short(analysis: Analysis) -> Lines:
+    """Yield the verdict of the nominal network in a sentence."""
     radius = radius_text(analysis.spectral_radius, analysis.spectral_radius_error, analysis.radius_excess)
     text = (
-        f"With every packet on time: {analysis.verdict}, spectral radius {radius} per frame of "
-        f"{analysis.frame_s * 1000:.6g} ms (apc analyze --nominal says all of it)."
+        f"Nominal network (no loss or jitter): {analysis.verdict}, spectral radius {radius} per frame of "
+        f"{analysis.frame_s * 1000:.6g} ms. All nominal results: apc analyze --nominal."
     )
-    return "\n".join(sentences(text))
+    yield from wrapped(text)
 
 
 def warning_lines(warnings: Sequence[str]) -> Lines:
@@ -230,8 +271,26 @@ def warning_lines(warnings: Sequence[str]) -> Lines:
 
 
 def network_answer_text(network_answer: NetworkAnswer) -> Lines:
-    """Yield the verdict over the lossy network, and its sensitivities."""
-    yield f"{network_answer.verdict}\n\n{network_answer.sensitivities}\n\n{network_answer.margins}"
+    """Yield the verdict over the lossy network, its margins and sensitivities."""
+    return network_answer_lines(network_answer)
+
+
+def network_answer_lines(network_answer: NetworkAnswer, warnings: Sequence[str] = ()) -> Lines:
+    """Yield the verdict over the lossy network, its margins and sensitivities.
+
+    Parameters
+    ----------
+    network_answer
+        The verdict with its margins and sensitivities.
+    warnings
+        Those of the topology, printed below the verdict.
+    """
+    first, *rest = str(network_answer.verdict).splitlines()
+    yield first
+    yield from warning_lines(warnings)
+    yield from rest
+    yield from margins_lines(network_answer.margins)
+    yield from sensitivities_lines(network_answer.sensitivities, radius="second-moment growth")
 
 
 def network_answer_document(network_answer: NetworkAnswer) -> Plain:
@@ -251,43 +310,54 @@ def answer_document(answer: AnalysisReport) -> Plain:
         "margins": document(answer.margins.rows),
         "margins_note": answer.margins.note,
         "limit_cycle_note": "" if answer.limit_cycle else answer.no_limit_cycle or NOT_SIMULATED,
-        "warnings": [*answer.warnings, *filter(None, (answer.event_order.warning,))],
+        "warnings": [*answer.warnings, *filter(None, (answer.order_warning,))],
     }
-    if answer.detailed:
+    if answer.event_order is not None:
         plain["event_order"] = answer.event_order.to_dict()
     if answer.box is not None:
         plain["box"] = answer.box.to_dict()
     return plain
 
 
-def _mode_table(modes: Sequence[Mode]) -> Lines:
-    """Yield a table of the slowest modes, and a count of the other modes."""
+def _mode_table(modes: Sequence[Mode], *, everything: bool = False) -> Lines:
+    """Yield a table of the slowest modes, the transport-delay modes on one line, and a count of the others.
+
+    Parameters
+    ----------
+    modes
+        All modes, the slowest first.
+    everything
+        Whether every mode has a row.
+    """
     # Modes indistinguishable from zero are only counted: their rounding depends on the machine.
-    alive = [mode for mode in modes if _is_alive(mode)]
-    rows = [mode for mode in alive if mode.eigenvalue.imag >= -mode.error]  # a conjugate pair is one row
-    shown = rows[:MOST_ROWS]
-    dead = [mode for mode in modes if not _is_alive(mode)]
+    alive = [mode for mode in modes if everything or _is_alive(mode)]
+    pairs = [mode for mode in alive if mode.eigenvalue.imag >= -mode.error]  # a conjugate pair is one row
+    folded = [
+        bool(number) and not everything and mode.in_transit > PACKETS for number, mode in enumerate(pairs)
+    ]
+    delays = list(itertools.compress(pairs, folded))
+    rows = [mode for mode, hidden in zip(pairs, folded, strict=True) if not hidden]
+    shown = rows if everything else rows[:MOST_ROWS]
+    dead = [] if everything else [mode for mode in modes if not _is_alive(mode)]
     left = len(dead) + len(rows) - len(shown)
     # A mode indistinguishable from zero may have any size up to its error.
     least = max(shown[-1].magnitude if shown else 0.0, 2 * LEAST_MAGNITUDE)
     unsure = sum(not mode.magnitude + mode.error <= least for mode in dead)
     if shown:
         yield from table([HEADINGS, *map(_cells, shown)], "><>>><")
-    if unsure:
-        many = "all" if unsure == left > 1 else str(unsure)
-        ends = "it dies" if unsure == 1 else "they die"
-        text = f"{counted(left, 'mode')} {'more' if shown else ''} (--json lists all),"
-        text += f" {many} of them known too roughly to say how fast {ends}"
-    elif shown:
-        text = f"{left} faster-dying {'one' if left == 1 else 'ones'} (--json lists all)"
-    else:
-        text = (
-            f"{counted(left, 'mode')} {'dies' if left == 1 else 'die'} out within a frame (--json lists all)"
-        )
+        if any(PAST in _leading(mode) for mode in shown):
+            yield from notes("(-T): value at T before the frame; sent(-T): value sent at that time")
+    if delays:
+        size = f"|eigenvalue| {delays[-1].magnitude:.3g} to {delays[0].magnitude:.3g}"
+        yield from notes(f"{counted(len(delays), 'transport-delay mode')} (packets in transit), {size}")
     if left:
-        yield from notes(f"and {text}" if shown else text)
+        more = "faster " * bool(shown)
+        text = f"{left} {more}mode{'s' * (left != 1)} not shown (--modes all)"
+        if unsure:
+            text += f"; {unsure} of them with an eigenvalue known only up to its error"
+        yield from notes(text)
     elif not shown:
-        yield "  nothing moves but that"
+        yield "  none"
 
 
 def _is_alive(mode: Mode) -> bool:
@@ -296,12 +366,13 @@ def _is_alive(mode: Mode) -> bool:
 
 
 def _cells(mode: Mode) -> tuple[str, ...]:
+    """Return the cells of a mode's row, in the order of `HEADINGS`."""
     return (
         _magnitude(mode),
         mode.family,
         str(mode.multiplicity),
-        in_hertz(mode.frequency_hz) if mode.frequency_hz else "–",
-        "–" if math.isnan(mode.damping_ratio) else f"{mode.damping_ratio + 0.0:.3g}",
+        in_hertz(mode.frequency_hz) if mode.frequency_hz else "real",
+        "–" if math.isnan(mode.damping_ratio) or not mode.frequency_hz else f"{mode.damping_ratio + 0.0:.3g}",
         _leading(mode),
     )
 
@@ -318,8 +389,8 @@ def _magnitude(mode: Mode) -> str:
 
 
 def _leading(mode: Mode) -> str:
-    largest = sorted(mode.participation, key=lambda item: -item[1])[:2]
-    return ", ".join(f"{name} {share:.0%}" for name, share in largest if share >= LEAST_SHARE)
+    name, share = max(mode.participation, key=lambda item: item[1], default=("", 0.0))
+    return f"{name} {share:.0%}" if share >= LEAST_SHARE else ""
 
 
 def model_size_text(model_size: ModelSize) -> Lines:
@@ -330,20 +401,27 @@ def model_size_text(model_size: ModelSize) -> Lines:
         for subsystem in model_size.subsystems
     )
     whole = model_size.peers > 1 and sum(count for count, _ in model_size.systems) == 1
-    noun = "determinant" if model_size.method == "determinant" else "system" if whole else "mode"
-    systems = " and ".join(f"{counted(count, noun)} of {size}" for count, size in model_size.systems)
-    analysed = f"not analysed: {model_size.refused}" if model_size.refused else f"analysed as {systems}"
-    pairs = "".join(f"; costs N²: {name} is evaluated once a pair of peers" for name in model_size.pairs)
-    yield f"{subsystems}, {counted(model_size.peers, 'peer')}; {analysed}{pairs}"
+    noun = "determinant" if model_size.method == "determinant" else "system" if whole else "subsystem"
+    systems = " and ".join(
+        f"{counted(count, noun)} of {counted(size, 'state')}" for count, size in model_size.systems
+    )
+    analysed = f"not analyzed: {model_size.refused}" if model_size.refused else f"analyzed as {systems}"
+    pairs = "".join(
+        f"; quadratic cost: {name} is evaluated for each pair of peers" for name in model_size.pairs
+    )
+    peers = counted(model_size.peers, "peer")
+    sizes = f"{peers}; {subsystems}" if several else f"{subsystems}, {peers}"
+    yield f"{sizes}; {analysed}{pairs}"
 
 
 def _subsystem(subsystem_sizes: SubsystemSize) -> str:
+    """Return the number of states of a peer, and of what they are, in words."""
     parts = [f"{subsystem_sizes.motion} motion"]
     if subsystem_sizes.stored:
         parts.append(f"{subsystem_sizes.stored} delayed force")
     if subsystem_sizes.packets:
         parts.append(f"{subsystem_sizes.packets} network")
-    return f"{subsystem_sizes.states} states a peer ({', '.join(parts)})"
+    return f"{subsystem_sizes.states} states per peer ({', '.join(parts)})"
 
 
 def box_proof_text(box_proof: RobustStability) -> Lines:
@@ -355,10 +433,10 @@ def box_proof_text(box_proof: RobustStability) -> Lines:
         )  # a proved box has no point
     ]
     cells = counted(box_proof.cells, "cell")
-    printed = f"undecided, {100 * box_proof.undecided_fraction:.3g} % of the box is left open ({cells})"
+    printed = f"undecided in {100 * box_proof.undecided_fraction:.3g} % of the box ({cells})"
     if box_proof.stable is not None:
         whole = f"proved {box_proof.verdict} for every value in the box ({cells})"
-        printed = whole if box_proof.stable else "not stable in all of the box"
+        printed = whole if box_proof.stable else "not stable in the entire box"
     yield f"{box_proof.topology}:"
     for text in (*box_proof.limitations, printed):
         yield from wrapped(text)
@@ -369,9 +447,9 @@ def box_proof_text(box_proof: RobustStability) -> Lines:
     elif (
         box_proof.stable is None and box_proof.counterexample
     ):  # otherwise there was no search, as its notes explain
-        yield "among others around"
+        yield "undecided, among others, near"
         yield from where
-        yield from wrapped(f"more cells may decide it: --cells {MORE_CELLS * box_proof.cells}")
+        yield from wrapped(f"Try more cells: --cells {MORE_CELLS * box_proof.cells}")
     if box_proof.changing is not None:
         yield ""
         yield from wrapped(changing_text(box_proof.changing, box_proof.ranges[0]))
@@ -381,19 +459,19 @@ def box_proof_text(box_proof: RobustStability) -> Lines:
 def changing_text(changing: ChangingDelay, over: Range) -> str:
     """Return the result for a time-varying delay, in a sentence."""
     low, high = (quantity(float(number), over.unit, 9) for number in (over.low, over.high))
-    printed = [changing.note or "open whether it stays stable"]
+    printed = [changing.note or "stability is undecided"]
     if changing.unstable is not None:
         first, second = changing.unstable
-        printed = [f"unstable if by turns {first} packets take {low} and {second} {high}"]
+        printed = [f"unstable if {first} packets with {low} and {second} packets with {high} alternate"]
     if changing.proved_to == float(over.high):
         printed = ["stable, proved by the small gain theorem"]
     elif changing.proved_to is not None:
         to = quantity(changing.proved_to, over.unit, 9)
         printed = [
             f"stable from {low} to {to}, proved by the small gain theorem",
-            f"over all of it {printed[0]}",
+            f"over the entire range {printed[0]}",
         ]
-    return f"However the delay changes from packet to packet: {'; '.join(printed)}."
+    return f"Delay that varies arbitrarily from packet to packet: {'; '.join(printed)}."
 
 
 def range_text(interval: Range) -> str:
@@ -429,18 +507,16 @@ def box_proof_document(box_proof: RobustStability) -> Plain:
 def contact_modes_text(contact_modes: ContactModes) -> Lines:
     """Yield the modes of contact as a table, and which is unstable in words."""
     if not contact_modes.modes:
-        yield f"{contact_modes.topology}: no part switches"
+        yield f"{contact_modes.topology}: no contact"
         yield from contact_modes.notes
         return
-    yield from wrapped(f"{contact_modes.topology}: {contact_modes.summary}")
-    yield ""
-    yield from (f"  {name} on: it follows the motion; off: it does not" for name in contact_modes.parts)
-    rows = [("spectral radius", "frequency", "verdict", "")]
-    refused = []
+    yield from wrapped(f"Contact modes: {contact_modes.summary}")
+    rows = [("spectral radius", "frequency", "verdict", "contacts")]
+    refused: dict[str, list[str]] = {}
     for mode in contact_modes.modes:
         if mode.refusal:
-            rows.append(("–", "–", "not analysed", mode.name))
-            refused.append(f"{mode.name}: not analysed: {mode.refusal}")
+            rows.append(("–", "–", "not analyzed", mode.name))
+            refused.setdefault(mode.refusal, []).append(mode.name)
             continue
         error = max(mode.spectral_radius_error, SHOWN if abs(mode.spectral_radius - 1) > NEAR else 0.0)
         radius = radius_text(mode.spectral_radius, error, mode.radius_excess)
@@ -450,102 +526,22 @@ def contact_modes_text(contact_modes: ContactModes) -> Lines:
     yield ""
     yield from table(rows, "<><<")
     if any(mode.linearized for mode in contact_modes.modes):
-        yield "\n  * near the start values: this piece is not linear"
-    yield from notes(*refused, *contact_modes.notes)
+        yield "\n  * linearized at the initial state: this mode is nonlinear"
+    reasons = (f"not analyzed: {', '.join(names)}: {why}" for why, names in refused.items())
+    yield from notes(*reasons, *contact_modes.notes)
 
 
 def contact_modes_document(contact_modes: ContactModes) -> Plain:
     """Return the modes of contact as plain data."""
-    modes = [_analysed(mode, {"on": dict(mode.on)}, "frequency_hz") for mode in contact_modes.modes]
+    modes = [refusable_record(mode, {"on": dict(mode.on)}, "frequency_hz") for mode in contact_modes.modes]
     return record(contact_modes, {"unstable": contact_modes.unstable, "modes": modes})
 
 
-def arbitrary_switching_text(arbitrary_switching: ArbitrarySwitching) -> Lines:
-    """Yield the result for arbitrary switching of contacts, in words."""
-    reach = arbitrary_switching.reach
-    if arbitrary_switching.stable:
-        text = "proved stable by the circle criterion"
-        if arbitrary_switching.jumps:
-            text += (
-                f" (as {arbitrary_switching.jumps} jumps where it opens, within bounds: it need not "
-                "come to rest)"
-            )
-    else:
-        text = (
-            f"{'cannot be proved' if arbitrary_switching.stable is False else 'not decided'}: "
-            f"{arbitrary_switching.reason}"
-        )
-    if reach is not None and math.isfinite(reach):
-        times = f"{math.floor(reach * 10**DECIMALS) / 10**DECIMALS:.6g}"
-        text += f"; the criterion holds for contacts up to {times} times as stiff"
-    elif reach is not None:
-        text += "; the criterion holds however stiff the contacts"
-    yield from wrapped(
-        f"{arbitrary_switching.topology}, contacts that open and close at will: {text}", "", "  "
-    )
-
-
-def arbitrary_switching_document(arbitrary_switching: ArbitrarySwitching) -> Plain:
-    """Return the result for arbitrary switching of contacts, as plain data."""
-    return {"stable": arbitrary_switching.stable, **record(arbitrary_switching)}
-
-
-def _analysed(result: ContactMode | Outcome, instead: Plain, *more: str) -> Plain:
+def refusable_record(result: Any, instead: Plain, *more: str) -> Plain:
     """Return plain data of a result that may be a refusal, without numbers then."""
     if not result.verdict:
         instead |= dict.fromkeys(("verdict", "spectral_radius", "spectral_radius_error", *more))
     return record(result, instead)
-
-
-def event_order_text(event_order: EventOrder) -> Lines:
-    """Yield the result of every event order."""
-    from apc.analysis.event_order import (  # loaded where there are outcomes, and else not needed
-        DEFAULT,
-        ORDERS,
-    )
-
-    headline = "the same verdict under every convention"
-    if not event_order.repeated:
-        headline = event_order.not_repeated
-    elif event_order.flips:
-        headline = "the verdict depends on the conventions"
-    yield f"{event_order.topology}: {headline}\n"
-    for number, outcome in enumerate(event_order.outcomes, 1):
-        radius = radius_text(outcome.spectral_radius, outcome.spectral_radius_error, outcome.radius_excess)
-        yield f"  {number}  {outcome.verdict or 'not analysed'}"
-        yield f"     spectral radius {radius}" if outcome.verdict else f"     {outcome.refusal}"
-        yield from (f"     {departure}" for departure in outcome.departures or (DEFAULT,))
-        if outcome.start:
-            yield f"     heard before the first packet: {outcome.start}"
-        yield f"     {len(outcome.orders)} of {ORDERS} orders, such as {' < '.join(outcome.orders[0])}"
-    if event_order.repeated and not event_order.start_matters:
-        yield "\n  What is heard before the first packet can't change the verdict."
-
-
-def event_order_document(event_order: EventOrder) -> Plain:
-    """Return the result of every event order as plain data."""
-    outcomes = [_analysed(outcome, {}) for outcome in event_order.outcomes]
-    return record(
-        event_order, {"flips": event_order.flips, "repeated": event_order.repeated, "outcomes": outcomes}
-    )
-
-
-def paper_method_text(paper_method: PaperMethod) -> Lines:
-    """Yield the shapes of the paper's matrices, a line each."""
-    yield f"ratio {paper_method.ratio}, frame {paper_method.frame_s * 1e3:.6g} ms"
-    for field in fields(paper_method):
-        matrix = getattr(paper_method, field.name)
-        if hasattr(matrix, "columns"):
-            which, mark, of = field.name.partition("_")
-            name = "A_cl" if which == "closed" else f"{which.upper()}{mark}{of.replace('d', 'D')}"
-            yield f"  {name:<6} {len(matrix.rows):>4} × {len(matrix.columns)}"
-
-
-def matrix_text(named_matrix: NamedMatrix) -> Lines:
-    """Yield the shape of a matrix and the ends of its names."""
-    rows, columns = named_matrix.rows, named_matrix.columns
-    ends = f": {rows[0]} … {rows[-1]} by {columns[0]} … {columns[-1]}" if named_matrix.values.size else ""
-    yield f"{len(rows)} × {len(columns)}{ends}"
 
 
 def analysis_picture(result: Analysis, ax: Any = None) -> Any:
@@ -570,16 +566,16 @@ def analysis_picture(result: Analysis, ax: Any = None) -> Any:
         times = f" × {mode.multiplicity}" if mode.multiplicity > 1 else ""
         label = f"{mode.magnitude:.4f}{times}, {in_hertz(mode.frequency_hz)}, {mode.family}"
         _mark(ax, mode.eigenvalue, MARKS[index % len(MARKS)], COLOURS[1 + index], label)
-    _mark(ax, rest, ".", "0.4", f"{len(rest)} that die out faster")
+    _mark(ax, rest, ".", "0.4", f"{len(rest)} faster modes")
     seconds = result.settling_s
-    settles = "" if seconds is None else f"; settles within 2 % in {seconds:.3g} s"
+    settles = "" if seconds is None else f"; settling time (2 %) {seconds:.3g} s"
     radius = f"spectral radius {result.spectral_radius:.6g} per frame of {1e3 * result.frame_s:g} ms{settles}"
     _entitle(ax, [f"{result.topology}: {result.verdict}", radius])
     return ax
 
 
 def locus_picture(locus: Locus, ax: Any = None) -> Any:
-    """Draw where eigenvalues go as a parameter grows; return the matplotlib Axes.
+    """Draw the root locus of a parameter; return the matplotlib Axes.
 
     Parameters
     ----------
@@ -599,16 +595,16 @@ def locus_picture(locus: Locus, ax: Any = None) -> Any:
     colours = np.repeat(locus.values, [len(eigenvalue) for eigenvalue in locus.eigenvalues])
     plotted = ax.scatter(points.real, points.imag, c=colours, s=5, linewidths=0, cmap="viridis", zorder=3)
     ax.figure.colorbar(plotted, ax=ax, label=axis_label(of.parameter, of.unit))
-    _mark(ax, locus.now, "x", COLOURS[2], f"now, {quantity(of.current, of.unit)}")
+    _mark(ax, locus.now, "x", COLOURS[2], f"present value, {quantity(of.current, of.unit)}")
     for index, crossing in enumerate(of.crossings[:MOST_NAMED]):
         if not locus.values.size or not locus.values[0] <= crossing.value <= locus.values[-1]:
             continue
         nearest = locus.eigenvalues[int(np.abs(locus.values - crossing.value).argmin())]
         at = nearest[np.abs(np.abs(nearest) - 1).argmin()]
         text = "" if np.isnan(crossing.frequency_hz) else f", {in_hertz(crossing.frequency_hz)}"
-        label = f"changes at {quantity(crossing.value, of.unit)}{text}"
+        label = f"stability limit {quantity(crossing.value, of.unit)}{text}"
         _mark(ax, at / abs(at), MARKS[index], "none", label)
-    _entitle(ax, [f"{of.topology}: eigenvalues of a frame of {1e3 * locus.frame_s:g} ms, packets on time"])
+    _entitle(ax, [f"{of.topology}: eigenvalues per frame of {1e3 * locus.frame_s:g} ms, nominal network"])
     return ax
 
 

@@ -1,9 +1,8 @@
 """A run as a moving picture: the bodies of every peer as `still_picture` draws them, from frame to frame.
 
 Takes: a `Model` and its `Trajectory`. Gives: `SUFFIXES`, `check_animation`, `save_animation`.
-Guarantees: what is shown is of the run's own rows, the nearest in time; everything that moves stays in sight;
-a run is slowed down or sped up to what can be watched, and how much is written above it; a file is there
-whole or not at all.
+Guarantees: frames show rows of the trajectory, the nearest in time; all moving bodies stay inside the axes.
+The speed relative to real time is in the title. A file is written completely or not at all.
 Does not: simulate the model, or need a display.
 
 matplotlib is loaded when something is drawn and not before; it writes GIF by Pillow, MP4 by ffmpeg.
@@ -22,9 +21,9 @@ import numpy as np
 from apc.compiler.compiled import Model
 from apc.compiler.files import check_target, write_file
 from apc.compiler.timings import part
-from apc.optional import missing, need
 from apc.output.object_shapes import heading
 from apc.output.still_picture import MM, draw_actors, keep_in_sight, widen
+from apc.support.optional import missing, need
 
 if TYPE_CHECKING:
     from apc.simulation.trajectory import Trajectory
@@ -37,13 +36,13 @@ DPI = 90
 
 
 def check_animation(path: Path) -> None:
-    """Refuse a moving picture that can't be made: E601 the place, E875 matplotlib or ffmpeg isn't there."""
+    """Refuse an animation that cannot be written: E601 the path, E875 matplotlib or ffmpeg is missing."""
     check_target(path)
     writers = need("matplotlib.animation", "plot").writers
     if path.suffix.lower() == ".mp4" and not writers.is_available("ffmpeg"):
         message = "ffmpeg is not installed, which writes .mp4"
-        hint = f"--out {path.with_suffix('.gif')}, or install ffmpeg, as by: apt install ffmpeg"
-        raise missing(message, hint)
+        fix = f"--out {path.with_suffix('.gif')}, or apt install ffmpeg"
+        raise missing(message, fix)
 
 
 @part("draw")
@@ -66,7 +65,7 @@ def save_animation(system: Model, trajectory: Trajectory, path: Path) -> None:
     """
     check_animation(path)
     moving = need("matplotlib.animation", "plot")
-    figure, actors = draw_actors(system)
+    figure, actors, lines = draw_actors(system)
     columns = {signal.name: index for index, signal in enumerate(trajectory.signals)}
     tracks = [MM * trajectory.values[:, [columns[name] for name in actor.states]] for actor in actors]
     turns = [heading(trajectory.values[:, [columns[text] for text in actor.turning]]) for actor in actors]
@@ -79,11 +78,12 @@ def save_animation(system: Model, trajectory: Trajectory, path: Path) -> None:
     times = np.linspace(start, end, round(RATE * seconds) + 1)
     rows = np.minimum(np.searchsorted(trajectory.time, times), len(trajectory.time) - 1)
     speed = (end - start) / seconds
-    pace = "" if abs(speed - 1) < 1e-3 else f", {speed:.2g} × as fast as it is"
-    pixels = [2 * round(side * DPI / 2) for side in figure.get_size_inches()]  # ffmpeg wants even ones
+    pace = "" if abs(speed - 1) < 1e-3 else f", {speed:.2g} × real time"
+    pixels = [2 * round(side * DPI / 2) for side in figure.get_size_inches()]  # ffmpeg requires even numbers
     figure.set_size_inches(*(side / DPI for side in pixels))
     title = figure.suptitle(" ", fontsize=11)
-    _paint_fixed_parts(figure, [title, *(artist for actor in actors for artist in actor.artists)])
+    moved = [artist for actor in actors for artist in actor.artists]
+    _paint_fixed_parts(figure, [title, *(line.line for line in lines), *moved])
 
     writer = moving.writers["ffmpeg" if path.suffix.lower() == ".mp4" else "pillow"](fps=RATE)
 
@@ -95,6 +95,8 @@ def save_animation(system: Model, trajectory: Trajectory, path: Path) -> None:
                     title.set_text(f"{system.name}: {trajectory.time[row]:.3f} s{pace}")
                     for actor, track, turn in zip(actors, tracks, turns, strict=True):
                         actor.move(track[row], turn[row])
+                    for line in lines:
+                        line.draw()
                     writer.grab_frame()
             shutil.copyfile(named, temporary)
 
@@ -102,7 +104,7 @@ def save_animation(system: Model, trajectory: Trajectory, path: Path) -> None:
 
 
 def _paint_fixed_parts(figure: Any, moving: Sequence[Any]) -> None:
-    """Make one image of all that does not move, behind what does: else every frame draws its axes anew."""
+    """Draw all fixed parts once, as an image behind the moving ones, so that no frame draws its axes."""
     agg = need("matplotlib.backends.backend_agg", "plot")
     figure.set_dpi(DPI)
     figure.draw_without_rendering()  # which lays it out, with room for all

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 from apc.benchmark.speed_and_error import SAME, Bench, MethodTiming, TaskComparison
 from apc.compiler.wording import counted, wrapped
 from apc.output.formatting import Lines, notes, record, table
-from apc.output.pictures import COLOURS, legend_below, new_figure
+from apc.output.pictures import COLOURS, new_figure
 from apc.verdict import StabilityVerdict
 
 if TYPE_CHECKING:
@@ -29,8 +29,8 @@ MARKS = "osDv^P<>"  # of methods
 LEAST = 1e-17  # where an error of zero is drawn
 NOTHING = "–"
 BETTER = (
-    "* on the Pareto front: none here is faster by more than both spreads and no less right, or more right "
-    f"and no slower; errors below {SAME:.1g} are roundings, and equal"
+    "* Pareto-optimal: no other method is faster (by more than both spreads) and as accurate, or more "
+    f"accurate and as fast; errors below {SAME:.1g} count as equal"
 )
 STARRED = {StabilityVerdict.STABLE_TRANSLATING: "stable*"}
 _SHORT = {**STARRED, StabilityVerdict.UNDECIDED: StabilityVerdict.UNDECIDED.word}
@@ -47,14 +47,15 @@ def bench_text(bench: Bench) -> Lines:
 
 
 def _task(comparison: TaskComparison) -> Lines:
-    yield f"apc {comparison.task}: time against error of the {comparison.quantity}"
+    """Yield the table of the methods of one task, with notes."""
+    yield f"apc {comparison.task}: time and error of the {comparison.quantity}"
     yield from notes(*comparison.limitations)
     yield ""
     if comparison.measured:
         rows = [("method", "median", "spread", "error", "bound", "")]
         for measured in comparison.measured:
             spread = NOTHING if measured.rounds < 2 else _time(measured.spread)
-            marks = ("*" if measured.front else " ") + (" chosen" if measured.chosen else "")
+            marks = ("*" if measured.front else " ") + (" default" if measured.chosen else "")
             rows.append(
                 (
                     measured.name,
@@ -71,31 +72,31 @@ def _task(comparison: TaskComparison) -> Lines:
         legend = [f"error and bound are {comparison.relative}", BETTER] if known else []
         reference = f"{'' if known else 'no '}reference: {comparison.reference}"
         yield from notes(_times(comparison), *legend, _choice(comparison), reference, *comparison.notes)
-    yield from notes(*(f"{name} left out: {reason}" for name, reason in comparison.refused))
+    yield from notes(*(f"{name} excluded: {reason}" for name, reason in comparison.refused))
 
 
 def _times(comparison: TaskComparison) -> str:
     """Return the meaning of the columns of times."""
     least, most = (pick(measured.rounds for measured in comparison.measured) for pick in (min, max))
     runs = counted(most, "run") if least == most else f"{least} to {most} runs"
-    columns = "median and spread (half the distance between the quartiles)"
-    return f"{columns} are of {runs}: processor time of {comparison.timed}"
+    return f"median and spread (half the interquartile range) of {runs}, processor time of {comparison.timed}"
 
 
 def _choice(comparison: TaskComparison) -> str:
+    """Return in words whether the default method of a task is Pareto-optimal."""
     chosen: MethodTiming | None = comparison.chosen
     if chosen is None:
-        return f"what {comparison.task} chooses is none of these"
+        return f"the default method of {comparison.task} is not among these"
     if chosen.error is None:
-        where = "which can't be judged without a reference"
+        where = "not rated without a reference"
     else:
-        where = "which is on the front" if chosen.front else "which is NOT on the front"
-    return f"{comparison.task} chooses {chosen.name}, {where}"
+        where = "Pareto-optimal" if chosen.front else "NOT Pareto-optimal"
+    return f"default method of {comparison.task}: {chosen.name} ({where})"
 
 
 def hard_text(hard_report: HardReport) -> Lines:
     """Yield a line for each hard case, and the failures."""
-    yield f"{hard_report.folder}: {counted(len(hard_report.cases), 'topology')} with a known truth\n"
+    yield f"{hard_report.folder}: {counted(len(hard_report.cases), 'topology')} with known results\n"
     rows = [("topology", "error", "bound", "bound÷error", "time", "verdict")]
     for case in hard_report.cases:
         loose = f"{case.looseness:.2g}" if math.isfinite(case.looseness) else NOTHING
@@ -103,18 +104,18 @@ def hard_text(hard_report: HardReport) -> Lines:
         rows.append((case.name, _size(case.error), _size(case.bound), loose, _time(case.seconds), mark))
     yield from table(rows, "<>>>><")
     yield ""
-    yield from notes("error and bound are of the spectral radius ρ, divided by ρ where it is above 1")
+    yield from notes("error and bound of the spectral radius ρ, relative if ρ > 1")
     if any(case.verdict in STARRED and not case.failed for case in hard_report.cases):
         yield from notes(*(f"{word}: {verdict}" for verdict, word in STARRED.items()))
-    yield from notes(*(f"{name} has no truth beside it: left out" for name in hard_report.without))
+    yield from notes(*(f"{name} excluded: no known result" for name in hard_report.without))
     yield from notes(*(f"FAILED {case.name}: {case.failed}" for case in hard_report.failures))
     if hard_report.failures:
         undecided = sum(case.undecided for case in hard_report.cases)
         unbounded = sum(case.unbounded for case in hard_report.cases)
         topologies = f"{len(hard_report.failures)} of {counted(len(hard_report.cases), 'topology')} failed"
-        yield from notes(f"{topologies}; {undecided} left open, {unbounded} without a bound")
+        yield from notes(f"{topologies}; {undecided} undecided, {unbounded} without a bound")
     else:
-        yield from notes("every bound holds; every verdict is right")
+        yield from notes("all bounds hold; all verdicts are correct")
 
 
 def scale_text(scale: Scale) -> Lines:
@@ -122,7 +123,7 @@ def scale_text(scale: Scale) -> Lines:
     from apc.benchmark.scale import REPEATS  # loaded where there is one, and else not needed
 
     alongside = {row.peers - row.count for row in scale.rows} - {0}
-    others = "".join(f", beside {number:,} of other groups" for number in sorted(alongside))
+    others = "".join(f", with {number:,} of other groups" for number in sorted(alongside))
     yield from wrapped(f"{scale.topology}: peers of group {scale.group}{others}")
     yield ""
     rows = [("peers", "compile", "analyze", "memory", "error", "bound", "method")]
@@ -135,7 +136,7 @@ def scale_text(scale: Scale) -> Lines:
     times = f"processor time of compiling, and the median of {REPEATS} analyses"
     yield from notes(
         f"{times}; error of the spectral radius",
-        f"memory is the most the whole process took, of which {scale.floor}",
+        f"memory: largest of the process, including {scale.floor}",
         *(f"{counted(count, 'peer', ',')}: {reason}" for count, reason in scale.refused),
     )
 
@@ -164,11 +165,12 @@ def bench_picture(bench: Bench) -> Any:
     axes = figure.subplots(1, len(bench.comparisons), squeeze=False)[0]
     for ax, comparison in zip(axes, bench.comparisons, strict=True):
         _panel(ax, comparison)
-    figure.suptitle(f"{bench.topology}: error against time", fontsize=11)
+    figure.suptitle(f"{bench.topology}: error versus time", fontsize=11)
     return figure
 
 
 def _panel(ax: Any, comparison: TaskComparison) -> None:
+    """Draw the error of each method over its time, and the Pareto front."""
     ax.set_title(f"apc {comparison.task}", fontsize=10)
     ax.set_xlabel("median time [s]")
     ax.set_ylabel(f"error of the {comparison.quantity}", fontsize=9)
@@ -195,8 +197,9 @@ def _panel(ax: Any, comparison: TaskComparison) -> None:
             label=point.name + (" (default)" if point.chosen else ""),
         )
     if max(map(_plotted, points)) < SAME:
-        ax.axhline(SAME, color="0.4", linewidth=0.8, linestyle=":", label="below are roundings")
-    legend_below(ax, -0.16, fontsize=7)
+        ax.axhline(SAME, color="0.4", linewidth=0.8, linestyle=":", label="rounding level")
+    style = {"ncols": 2, "fontsize": 7, "frameon": False}
+    ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), **style)  # every method is identified
 
 
 def _plotted(measured: MethodTiming) -> float:

@@ -17,11 +17,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from apc.compiler.wording import counted, known_digits, wrapped
+from apc.compiler.wording import counted, known_digits, with_unit, wrapped
 from apc.output.formatting import (
     MEANT,
     Lines,
     Plain,
+    headed,
     notes,
     picked,
     quantity,
@@ -32,22 +33,18 @@ from apc.output.formatting import (
     table,
     uncertain,
 )
-from apc.output.pictures import COLOURS, new_figure
-from apc.tables import Row, TableColumn, Tabled
+from apc.output.pictures import COLOURS, MOST, new_figure, notes_below, prefixed
+from apc.support.tables import Row, TableColumn, Tabled
 
 if TYPE_CHECKING:
-    from apc.comparison.comparison import Scheme, SchemeComparison
-    from apc.parameter_studies.critical_values import Critical
+    from apc.studies.comparison import Scheme, SchemeComparison
+    from apc.studies.critical_values import Critical
 
 NONE = "–"
 DIGITS = 6  # number of transparency values, at most
 
 # The varied parameters, and the headings of their columns.
-VARIED = (
-    ("stiffness", "largest stable stiffness"),
-    ("delay", "delay that breaks it"),
-    ("loss", "loss that breaks it"),
-)
+VARIED = ("stiffness", "delay", "loss")
 
 # How bars are hatched: as 7 colours and 8 hatches have no common divisor, the first 56 schemes all differ.
 HATCHES = ("", "////", "\\\\\\\\", "||||", "xxxx", "----", "....", "oooo")
@@ -66,48 +63,60 @@ BOUNDARY = 1.0  # the spectral radius from which on a motion grows
 
 # The panels: title, and where in a scheme the number is; how many of its units what is varied is drawn in.
 NUMBERS = (
-    ("spectral radius a frame", "analysis.spectral_radius"),
-    ("settles within 2 % in (s)", "analysis.settling_s"),
-    ("felt at 1 Hz (N·s/m)", "transparency.impedance.0"),
-    ("felt at 10 Hz (N·s/m)", "transparency.impedance.1"),
-    ("operations a tick", "effort.operations"),
-    ("numbers sent a second", "effort.sent"),
+    ("spectral radius per frame", "analysis.spectral_radius"),
+    ("settling time, 2 % [s]", "analysis.settling_s"),
+    ("impedance at 1 Hz [N·s/m]", "transparency.impedance.0"),
+    ("impedance at 10 Hz [N·s/m]", "transparency.impedance.1"),
+    ("operations per tick", "effort.operations"),
+    ("numbers sent per second", "effort.sent"),
 )
 REACHES = (
-    ("largest stable stiffness (N/m)", "stiffness", 1.0),
-    ("delay that breaks it (ms)", "delay", 1e3),
-    ("loss that breaks it (%)", "loss", 1e2),
+    ("largest stable stiffness [N/m]", "stiffness", 1.0),
+    ("largest stable delay [ms]", "delay", 1e3),
+    ("largest stable loss [%]", "loss", 1e2),
 )
 
 
 def comparison_text(comparison: SchemeComparison) -> Lines:
-    """Yield the output of `apc compare`: a table for each quantity, a line for each scheme."""
+    """Yield the output of `apc compare`: tables of stability, limits, impedance and cost, notes last."""
     schemes = comparison.schemes
     feet: dict[str, int] = {}
-    yield counted(len(schemes), "scheme") + " side by side" * (len(schemes) > 1)
-    yield from notes(
-        *_meant(comparison), *comparison.limitations, *(f"note: {text}" for text in comparison.notes)
+    yield f"Comparison of {counted(len(schemes), 'scheme')}"
+    yield ""
+    yield from table(
+        [
+            ("", "scheme", "peers"),
+            *((str(index), scheme.topology, f"{scheme.peers:,}") for index, scheme in enumerate(schemes, 1)),
+        ],
+        "<<>",
     )
-    tables: list[tuple[tuple[str, ...], Iterable[tuple[str, ...]]]] = [
-        (("",), [(f"{scheme.topology}, {counted(scheme.peers, 'peer', ',d')}",) for scheme in schemes]),
-        (("verdict", "spectral radius a frame"), [_verdict(scheme, feet) for scheme in schemes]),
-    ]
+    verdicts = [_verdict(scheme, feet) for scheme in schemes]
+    yield from _scheme_table("Stability", ("verdict", "spectral radius per frame", "settling time"), verdicts)
     if any(scheme.linearized for scheme in schemes):
-        tables.append((("in time", "played"), [_in_time(scheme, feet) for scheme in schemes]))
-    for key, heading in VARIED:
-        tables.append(((heading, "of"), [_varied(scheme, key, feet) for scheme in schemes]))
-    tables.append(
-        (("felt at 1 Hz", "at 10 Hz", "of the hand at"), [_transparency(scheme, feet) for scheme in schemes])
-    )
-    tables.append((("work a tick", "a peer sends at most", "all send"), map(_costs, schemes)))
-    for headings, cells in tables:
-        rows = [("", *headings), *((str(index), *row) for index, row in enumerate(cells, 1))]
-        yield ""
-        yield from filter(None, table(rows, later=5))
-    if feet:
+        rows = [_in_time(scheme, feet) for scheme in schemes]
+        yield from _scheme_table("Simulation", ("verdict", "duration"), rows)
+    limits = [
+        (str(index), key, *_limit_cells(scheme, key, feet))
+        for key in VARIED
+        for index, scheme in enumerate(schemes, 1)
+    ]
+    yield from headed("Stability limits", table([("", "limit of", "stable up to", "parameter"), *limits]))
+    impedances = [_impedance_cells(scheme, feet) for scheme in schemes]
+    yield from _scheme_table("Impedance", ("at 1 Hz", "at 10 Hz", "device"), impedances)
+    headings = ("computation per tick", "sent per peer", "sent in total")
+    yield from _scheme_table("Cost", headings, [_cost_cells(scheme) for scheme in schemes])
+    texts = (*_meant(comparison), *comparison.limitations, *comparison.notes)
+    if feet or texts:
         yield ""
     for text, number in feet.items():
         yield from wrapped(text, f"  [{number}] ", "      ")
+    yield from notes(*texts)
+
+
+def _scheme_table(title: str, headings: Sequence[str], rows: Sequence[Sequence[str]]) -> Lines:
+    """Yield a titled table with a row for each scheme, numbered."""
+    numbered = [("", *headings), *((str(index), *row) for index, row in enumerate(rows, 1))]
+    return headed(title, (line for line in table(numbered, later=5) if line))
 
 
 def _marked(cell: str, texts: Iterable[str], feet: dict[str, int]) -> str:
@@ -116,10 +125,11 @@ def _marked(cell: str, texts: Iterable[str], feet: dict[str, int]) -> str:
     return " ".join([cell, *marks])
 
 
-def _costs(scheme: Scheme) -> tuple[str, ...]:
+def _cost_cells(scheme: Scheme) -> tuple[str, ...]:
+    """Return the operations per tick, and the numbers sent per second by one peer and by all peers."""
     effort = scheme.effort
     clock = f" of {effort.clock}" if effort.clock else ""
-    sent = (f"{number:,.6g} a second" for number in (effort.sent, effort.sent_by_all))
+    sent = (f"{number:,.6g} numbers/s" for number in (effort.sent, effort.sent_by_all))
     return f"{counted(effort.operations, 'operation', ',d')}{clock}", *sent
 
 
@@ -127,33 +137,34 @@ def _meant(comparison: SchemeComparison) -> Iterator[str]:
     """Yield the stability criterion, if it is not the decay of motions."""
     if any(scheme.passive for scheme in comparison.schemes):
         yield MEANT["passive"]
-    elif any(
-        reached(scheme, f"{key}.criterion") in MEANT for scheme in comparison.schemes for key, _ in VARIED
-    ):
-        yield f"of a link that is, or becomes, unreliable: {MEANT['mean-square']}"
+    elif any(reached(scheme, f"{key}.criterion") in MEANT for scheme in comparison.schemes for key in VARIED):
+        yield "Criterion for unreliable links: mean-square stability over the lossy network"
 
 
 def _why(scheme: Scheme, key: str) -> tuple[str, ...]:
+    """Return the reasons why a result of a scheme is missing, empty if it is there."""
     return tuple(text for name, text in scheme.missing if name == key)
 
 
-def _verdict(scheme: Scheme, feet: dict[str, int]) -> tuple[str, str]:
+def _verdict(scheme: Scheme, feet: dict[str, int]) -> tuple[str, str, str]:
+    """Return the verdict, the spectral radius with its footnotes, and the settling time."""
     if scheme.analysis is None:
-        return scheme.verdict, _marked(NONE, [scheme.refused], feet)
+        return scheme.verdict, _marked(NONE, [scheme.refused], feet), NONE
     texts = list(_why(scheme, "verdict"))
     if scheme.network is not None and scheme.network.mean_square_radius is not None:
         root, error = math.sqrt(scheme.network.mean_square_radius), scheme.network.error or 0.0
         grown = radius_text(root, error / (2 * root) if root else error)
         texts.append(
-            "the radius is that with every packet on time; "
-            f"mean squares are multiplied by {grown} squared a frame"
+            "the spectral radius is that of the nominal network; the square root of the second-moment growth "
+            f"is {grown} per frame"
         )
     if scheme.passive is not None:
-        texts.append("the radius is that with free hands")
+        texts.append("the spectral radius is that with free devices")
     verdict = scheme.verdict + (", linearized" if scheme.analysis.linearized else "")
     analysis = scheme.analysis
     radius = radius_text(analysis.spectral_radius, analysis.spectral_radius_error, analysis.radius_excess)
-    return verdict, _marked(radius, texts, feet)
+    settling = NONE if analysis.settling_s is None else quantity(analysis.settling_s, "s", 3)
+    return verdict, _marked(radius, texts, feet), settling
 
 
 def _in_time(scheme: Scheme, feet: dict[str, int]) -> tuple[str, str]:
@@ -161,7 +172,7 @@ def _in_time(scheme: Scheme, feet: dict[str, int]) -> tuple[str, str]:
     if scheme.analysis is None:
         return NONE, NONE
     if not scheme.linearized:
-        return "as its verdict says: it is linear", ""
+        return "not required: the topology is linear", ""
     if scheme.simulated is None:
         return _marked(NONE, _why(scheme, "simulated"), feet), NONE
     summary = scheme.simulated.summary
@@ -173,17 +184,18 @@ def _in_time(scheme: Scheme, feet: dict[str, int]) -> tuple[str, str]:
     return text, f"{summary.end:g} s"
 
 
-def _varied(scheme: Scheme, key: str, feet: dict[str, int]) -> tuple[str, str]:
+def _limit_cells(scheme: Scheme, key: str, feet: dict[str, int]) -> tuple[str, str]:
+    """Return how far a scheme is stable in the parameter `key` of `VARIED`, and that parameter's name."""
     critical: Critical | None = getattr(scheme, key)
     if critical is None:
         return _marked(NONE, _why(scheme, key), feet), NONE
     remarks = []
     if len(critical.crossings) > 1:
         remarks.append(
-            f"{counted(len(critical.crossings), 'crossing')} in all: apc critical {critical.parameter}"
+            f"{counted(len(critical.crossings), 'critical value')}: apc critical {critical.parameter}"
         )
     if critical.groups:
-        remarks.append("one value for all groups, which differ in the topology")
+        remarks.append("varied as one value for all groups, whose values differ")
     return _marked(_reach(critical), remarks, feet), critical.parameter
 
 
@@ -192,23 +204,28 @@ def _reach(critical: Critical) -> str:
     if critical.value is None:
         assert critical.verdict is not None
         if not critical.has_effect:
-            return f"{critical.verdict.word} whatever it is"
+            return f"{critical.verdict.word} at every value"
         if critical.verdict.stable:
-            return f"none up to {quantity(critical.searched_to[1], critical.unit)}"
-        return f"{critical.verdict.word} from {span(*critical.searched_to, critical.unit)}"
+            return f"no limit up to {quantity(critical.searched_to[1], critical.unit)}"
+        return f"{critical.verdict.word} at {span(*critical.searched_to, critical.unit)}"
     value = uncertain(critical.value, critical.error or 0.0, critical.unit).removesuffix(", exact")
-    return value if critical.stable_side == "below" else f"{value}, stable above it"
+    return value if critical.stable_side == "below" else f"{value} (stable above)"
 
 
-def _transparency(scheme: Scheme, feet: dict[str, int]) -> tuple[str, str, str]:
+def _impedance_cells(scheme: Scheme, feet: dict[str, int]) -> tuple[str, str, str]:
+    """Return the impedances at 1 Hz and 10 Hz as magnitude and angle, and the device.
+
+    A missing result is a dash with a footnote; `feet` are the numbers of the footnotes by their texts.
+    """
     if scheme.transparency is None:
         return _marked(NONE, _why(scheme, "transparency"), feet), NONE, NONE
     cells = []
     for value, bound in zip(
         scheme.transparency.impedance.tolist(), scheme.transparency.bound.tolist(), strict=True
     ):
-        size = known_digits(abs(value), abs(value) * bound, DIGITS)
-        cells.append(f"{size} N*s/m, {np.degrees(np.angle(value)):.2f}°")
+        # The bound is relative.
+        magnitude = known_digits(abs(value), abs(value) * bound, DIGITS)
+        cells.append(f"{magnitude} N*s/m, {np.degrees(np.angle(value)):.2f}°")
     return cells[0], cells[1], scheme.transparency.at
 
 
@@ -218,6 +235,7 @@ def comparison_document(comparison: SchemeComparison) -> Plain:
 
 
 def _document(scheme: Scheme) -> Plain:
+    """Return the results of a scheme as plain data."""
     return record(
         scheme, {**picked(scheme, "verdict", "stable", "limitations"), "missing": dict(scheme.missing)}
     )
@@ -258,7 +276,7 @@ COLUMNS: list[tuple[TableColumn, str]] = [
     *_varied_columns("stiffness", "N/m"),
     *_varied_columns("delay", "s"),
     *_varied_columns("loss", ""),
-    (TableColumn("felt at", kind="text"), "transparency.at"),
+    (TableColumn("impedance at", kind="text"), "transparency.at"),
     (TableColumn("impedance at 1 Hz real", "N*s/m"), "transparency.impedance.0.real"),
     (TableColumn("impedance at 1 Hz imaginary", "N*s/m"), "transparency.impedance.0.imag"),
     (TableColumn("impedance at 10 Hz real", "N*s/m"), "transparency.impedance.1.real"),
@@ -303,26 +321,44 @@ def comparison_picture(comparison: SchemeComparison) -> Any:
         for title, key, scale in REACHES
     ]
     panels[2:2] = reaches
-    rows = -(-len(panels) // ABREAST)
+    keys = {title: key for title, key, _ in REACHES}
+    empty = [title for title, bars in panels if all(bar.text == NONE for bar in bars)]
+    panels = [(title, bars) for title, bars in panels if title not in empty] or panels[:1]
+    columns = min(ABREAST, len(panels))
+    rows = -(-len(panels) // columns)
     names = [
         "\n".join(textwrap.wrap(f"{index}  {scheme.topology}", LABEL))
         for index, scheme in enumerate(schemes, 1)
     ]
-    size = (PANEL * ABREAST + 1.4, (0.9 + BAR * 1.25 * len(names)) * rows + 0.5)
+    size = (PANEL * columns + 1.4, (0.9 + BAR * 1.25 * len(names)) * rows + 0.5)
     figure = new_figure(size)
-    axes = figure.subplots(rows, ABREAST, squeeze=False, sharey=True).ravel()
-    for ax, (title, bars) in zip(axes, panels, strict=True):
-        _draw(ax, title, bars)
+    axes = figure.subplots(rows, columns, squeeze=False, sharey=True).ravel()
+    for ax, (title, bars) in zip(axes, panels, strict=False):
+        _draw(ax, title, bars, BOUNDARY if title == NUMBERS[0][0] else 0.0)
+    for ax in axes[len(panels) :]:
+        ax.set_axis_off()
     axes[0].set_yticks(range(len(names)), names, fontsize=8)
     axes[0].invert_yaxis()
-    axes[0].axvline(BOUNDARY, color="0.4", linewidth=0.8, linestyle=(0, (3, 2)))
     for index, scheme in enumerate(schemes):
         axes[0].annotate(_verdict_text(scheme), (0, index), (4, 0), **LETTERS)
-    lines = [
-        line for text in (*comparison.limitations, *comparison.notes) for line in textwrap.wrap(text, 110)
-    ]
-    figure.suptitle("\n".join(lines), fontsize=8.5)
+    notes_below(
+        figure,
+        [
+            *comparison.limitations,
+            *comparison.notes,
+            *(
+                f"No panel for {title.partition(' [')[0]}: {_why_empty(schemes, keys[title])}"
+                for title in empty
+                if title in keys
+            ),
+        ],
+    )
     return figure
+
+
+def _why_empty(schemes: Sequence[Scheme], key: str) -> str:
+    """Return the reasons why no scheme has a varied quantity, each once."""
+    return "; ".join(dict.fromkeys(text for scheme in schemes for text in _why(scheme, key))) or "no result"
 
 
 def _number(value: complex | None) -> _Bar:
@@ -332,15 +368,22 @@ def _number(value: complex | None) -> _Bar:
 def _reach_bar(critical: Critical | None, scale: float) -> _Bar:
     """Return the stable range of a scheme: up to a crossing, or beyond the searched range."""
     if critical is not None and critical.value is not None and critical.stable_side == "below":
-        return _Bar(scale * critical.value, f"{scale * critical.value:.4g}")
+        return _Bar(scale * critical.value, _readable(scale * critical.value, scale))
     verdict = None if critical is None else critical.verdict
     if critical is not None and verdict is not None and verdict.stable:
-        return _Bar(scale * critical.searched_to[1], f"> {scale * critical.searched_to[1]:.4g}", further=True)
+        end = scale * critical.searched_to[1]
+        return _Bar(end, f"> {_readable(end, scale)}", further=True)
     return _Bar(0.0, verdict.word if verdict is not None and verdict.stable is False else NONE)
 
 
-def _draw(ax: Any, title: str, bars: Sequence[_Bar]) -> None:
-    """Draw one quantity of all schemes."""
+def _readable(number: float, scale: float) -> str:
+    """Return a number in the unit of its panel; a large stiffness with its own unit."""
+    factor, unit = prefixed(number, "N/m") if scale == 1 and number > MOST else (1.0, "1")
+    return with_unit(f"{number * factor:.4g}", unit)
+
+
+def _draw(ax: Any, title: str, bars: Sequence[_Bar], boundary: float) -> None:
+    """Draw one quantity of all schemes, with a line at a boundary above 0, left of all numbers."""
     ax.set_title(title, fontsize=8.5)
     ax.tick_params(labelsize=8)
     ax.tick_params(axis="y", length=0)
@@ -352,9 +395,12 @@ def _draw(ax: Any, title: str, bars: Sequence[_Bar]) -> None:
     hatches = [HATCHES[index % len(HATCHES)] for index in range(len(bars))]
     faces = ["white" if hatch else edge for hatch, edge in zip(hatches, edges, strict=True)]
     style = {"color": faces, "edgecolor": edges, "hatch": hatches, "linewidth": 0.8}
-    plotted = ax.barh(range(len(bars)), lengths, height=0.6, **style)
-    ax.bar_label(plotted, [bar.text for bar in bars], padding=4, fontsize=8, bbox=LETTERS["bbox"])
-    ax.set(xlim=(0, 1.3 * max(lengths) or 1.0), ylim=(-0.6, len(bars) - 0.4))
+    ax.barh(range(len(bars)), lengths, height=0.6, **style)
+    if boundary:
+        ax.axvline(boundary, color="0.4", linewidth=0.8, linestyle=(0, (3, 2)))
+    for index, (bar, length) in enumerate(zip(bars, lengths, strict=True)):
+        ax.annotate(bar.text, (max(length, boundary), index), (4, 0), **LETTERS)
+    ax.set(xlim=(0, 1.4 * max([*lengths, boundary]) or 1.0), ylim=(-0.6, len(bars) - 0.4))
     ax.locator_params(axis="x", nbins=4)
 
 

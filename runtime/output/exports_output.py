@@ -1,6 +1,6 @@
 """Exported models in words and as plain data.
 
-Takes: what `exports` makes: a state space, a Modelica model, a peer's code, an FMU.
+Takes: results of `exports`: a state space, a Modelica model, a peer's code, an FMU.
 Gives: of each its text, and its document; `state_space_control`.
 Guarantees: at most 80 columns.
 Does not: write files.
@@ -41,17 +41,15 @@ def state_space_text(state_space: StateSpace) -> Lines:
     ):
         yield from _numbered(word, [port.name for port in ports])
     if state_space.symbolic:
-        free = listed([port.name for port in state_space.symbolic])
-        yield from notes(f"A, B, C and D are a function of {free}")
+        symbolic_names = listed([port.name for port in state_space.symbolic])
+        yield from notes(f"A, B, C and D are functions of {symbolic_names}")
     yield ""
     yield from notes(state_space.meaning, *state_space.notes)
 
 
 def state_space_control(state_space: StateSpace) -> Any:
     """Return a state space as python-control's."""
-    from apc.exports.state_space_files import (
-        as_control,  # what writes files is asked for where one is written
-    )
+    from apc.exports.state_space_files import as_control  # loaded only on use
 
     return as_control(state_space)
 
@@ -69,7 +67,7 @@ def state_space_document(state_space: StateSpace) -> Plain:
 
 def modelica_text(model: ModelicaModel) -> Lines:
     """Yield the contents of a Modelica model."""
-    yield f"{model.topology}: the model {model.name} of Modelica 3.3\n"
+    yield f"{model.topology}: Modelica 3.3 model {model.name}\n"
     yield f"  {counted(model.peers, 'peer')}, {counted(model.variables, 'variable')}, one equation each"
     yield from (f"  {clock}" for clock in model.clocks)
 
@@ -89,11 +87,11 @@ def code_text(code: Code) -> Lines:
             "measures",
             [f"{peer.peer_type.states[i].name} [{peer.peer_type.states[i].unit}]" for i in peer.measured],
         ),
-        ("hears", [f"{sender.name} over {line.link}" for line in peer.lines for sender in line.senders]),
-        ("puts out", [f"{force.name} [N]" for force in peer.forces.values()]),
+        ("receives", [f"{sender.name} over {line.link}" for line in peer.lines for sender in line.senders]),
+        ("outputs", [f"{force.name} [N]" for force in peer.forces.values()]),
         ("sends", [f"{name} over {line.link}" for line in peer.sending for name in line.channels]),
         (
-            "moves itself",
+            "integrates",
             [state.name for i, state in enumerate(peer.peer_type.states) if i not in peer.outside],
         ),
     ):
@@ -141,11 +139,10 @@ def unit_text(unit: FmuContent) -> Lines:
     )
     if fixed:
         yield from _numbered("parameter", fixed)
-    text = f"steps of {unit.step * 1e3:.6g} ms show every tick of the fastest clock, values before the tick"
-    if unit.peer:
-        text += "; what it hears is set when it has arrived: delays and losses are the network's"
+    step = f"step {unit.step * 1e3:.6g} ms: every tick of the fastest clock, values before the tick"
+    received = "received values are inputs, set at their arrival; the FMU has no delays and losses"
     yield ""
-    yield from notes(text)
+    yield from notes(step, received if unit.peer else "")
 
 
 def unit_document(unit: FmuContent) -> Plain:

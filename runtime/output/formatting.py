@@ -1,8 +1,9 @@
 """The forms that all results share: plain data, JSON, notes, labelled lines and tables.
 
 Takes: frozen values, texts.
-Gives: `Plain`, `document`, `record`, `picked`, `reached`, `json_text`; `radius_text`, `quantity`,
-`uncertain`, `span`, `axis_label`, `listed`; `Lines`, `notes`, `sentences`, `labelled`, `table`; `MEANT`.
+Gives: `Plain`, `document`, `record`, `picked`, `reached`, `json_text`; `full_digits`, `radius_text`,
+`quantity`, `with_error`, `uncertain`, `span`, `axis_label`, `listed`; `Lines`, `notes`, `sentences`,
+`labelled`, `headed`, `table`; `MEANT`.
 Guarantees: a document is made of what JSON has words for; the same value gives the same text; a line is at
 most 80 columns wide where its words allow it.
 Does not: know a result.
@@ -10,23 +11,26 @@ Does not: know a result.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from contextvars import ContextVar
 from dataclasses import fields, is_dataclass
+from decimal import Decimal
 from fractions import Fraction
 from typing import Any
 
 from apc.compiler.wording import measured, with_unit, wrapped
-from apc.frame.display_units import as_shown
-from apc.lazy import LazyTuple
+from apc.parameter_values.display_units import as_shown
 from apc.result import Result
+from apc.support.lazy import LazyTuple
 from apc.verdict import Note, Sentence, Term
 
 # The stability criterion by a criterion, where it is not that motions die out.
 MEANT = {
-    "mean-square": "judged in mean square, over the network as it is",
-    "passive": "judged with every passive hand at every device",
+    "mean-square": "criterion: mean-square stability over the lossy network",
+    "passive": "criterion: absolute stability with any passive operator at every device",
 }
 
 # Plain data, ready for JSON.
@@ -38,7 +42,12 @@ Lines = Iterator[str]
 # A number nearer to 1 is printed by its distance from 1, with this number of digits at most.
 NEAR, REPORTED = 1e-6, 1e-4
 
-LINEARIZED = ", linearized at its start"
+LINEARIZED = ", linearized at the initial state"
+
+# Significant digits of a number in text.
+DIGITS = 6
+
+_FULL: ContextVar[bool] = ContextVar("full_digits", default=False)
 
 
 def document(value: Any) -> Any:
@@ -131,13 +140,45 @@ def radius_text(radius: float, error: float, radius_excess: tuple[float, float] 
 def quantity(value: float, unit: str, digits: int = 6) -> str:
     """Return an SI number with `digits` digits in its display unit."""
     by, shown = as_shown(value, unit)
-    return with_unit(f"{value * by:.{digits}g}", shown)
+    number = float(value * by)
+    if shown.startswith("N") and 10**digits <= abs(number) < math.inf:  # instead of an exponent
+        number, shown = number / 1000, f"k{shown}"
+    return with_unit(f"{number:.{digits}g}", shown)
+
+
+@contextlib.contextmanager
+def full_digits() -> Iterator[None]:
+    """Print numbers with all digits that their errors permit, and with the errors."""
+    token = _FULL.set(True)
+    try:
+        yield
+    finally:
+        _FULL.reset(token)
+
+
+def with_error(value: float, error: float, unit: str = "1") -> str:
+    """Return a number to `DIGITS` digits; with its error where that is larger, or all digits are requested.
+
+    Parameters
+    ----------
+    value, error, unit
+        The number and the bound of its error, both in `unit`.
+    """
+    shown = f"{value:.{DIGITS}g}"
+    if _FULL.get() or not (math.isfinite(value) and value and error <= _half_digit(shown)):
+        return measured(value, error, unit)
+    return with_unit(shown, unit)
+
+
+def _half_digit(shown: str) -> float:
+    """Return half a unit of the last of `DIGITS` significant digits of a number other than 0."""
+    return 0.5 * 10.0 ** (Decimal(shown).adjusted() - DIGITS + 1)
 
 
 def uncertain(value: float, error: float, unit: str) -> str:
-    """Return a number in SI with its error, in the unit in which people are shown it."""
+    """Return an SI number in its display unit, as `with_error` does; an exact number is marked as such."""
     by, shown = as_shown(value, unit)
-    return measured(value * by, error * by, shown) if error else f"{quantity(value, unit, 15)}, exact"
+    return with_error(value * by, error * by, shown) if error else f"{quantity(value, unit, 15)}, exact"
 
 
 def span(low: float, high: float, unit: str) -> str:
@@ -168,7 +209,17 @@ def sentences(*texts: str) -> Lines:
         yield from wrapped(text, "  ", "  ")
 
 
-def labelled(*rows: tuple[str, str], width: int = 17) -> Lines:
+def headed(title: str, lines: Lines) -> Lines:
+    """Yield an empty line, a title, an empty line and the lines; nothing without lines."""
+    for number, line in enumerate(lines):
+        if not number:
+            yield ""
+            yield from wrapped(title)
+            yield ""
+        yield line
+
+
+def labelled(*rows: tuple[str, str], width: int = 20) -> Lines:
     """Yield texts next to their labels, in a column of fixed width; nothing for an empty text."""
     for label, text in rows:
         if text:

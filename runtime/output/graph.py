@@ -21,8 +21,8 @@ from apc.compiler.topology.links import LinkDeclaration
 from apc.compiler.topology.topology import Topology
 from apc.compiler.view.diagram import Box, Diagram, DiagramEdge, node_of, seconds, shape_of
 from apc.compiler.wording import counted
-from apc.optional import need
 from apc.output.pictures import COLOURS
+from apc.support.optional import need
 
 # All in points.
 SIZE, TITLE = 8.0, 12.0  # of letters
@@ -127,9 +127,13 @@ def _height(box: Box) -> float:
     return LINE * len(box.lines) + 2 * PAD
 
 
-def _draw(ax: Any, box: Box, index: tuple[float, float, float, float], colours: dict[str, str]) -> None:
+def _draw(ax: Any, box: Box, rectangle: tuple[float, float, float, float], colours: dict[str, str]) -> None:
+    """Draw a box of a topology and its lines of text.
+
+    `rectangle` is its left, top, width and height, without the margin.
+    """
     patches = need("matplotlib.patches", "plot")
-    left, top, width, height = index[0] + MARGIN, *index[1:]
+    left, top, width, height = rectangle[0] + MARGIN, *rectangle[1:]
     style = "round,pad=0,rounding_size=6" if box.role != "mass" else "square,pad=0"
     edge = colours.get(box.key) or colours.get(f"clock {box.clock}", FAINT)
     fill, dash = FILLS.get(box.role, "white"), "--" if box.role == "link" else "-"
@@ -166,7 +170,7 @@ def _draw_peers(ax: Any, topology: Topology, link: LinkDeclaration, colours: dic
     networkx.draw_networkx(graph, positions, ax=ax, nodelist=range(number), node_color=fills, **node_style)
     text = f"{link.name}: {counted(topology.peers, 'peer', ',')}, {shape_of(link)}"
     if topology.peers > number:
-        text += f"\n{number} drawn, {topology.peers - number:,} left out"
+        text += f"\n{number} of {topology.peers:,} peers drawn"
     ax.set_title(text, size=SIZE, color=INK)
     ax.set(xlim=(-1.2, 1.2), ylim=(-1.2, 1.2), aspect="equal")
     ax.set_axis_off()

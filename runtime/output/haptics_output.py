@@ -15,25 +15,28 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.wording import known_digits, measured, wrapped
+from apc.compiler.wording import known_digits, wrapped
 from apc.output.formatting import (
     LINEARIZED,
     Lines,
     Plain,
     document,
+    headed,
     labelled,
     notes,
     radius_text,
     record,
     sentences,
     table,
+    with_error,
 )
-from apc.output.pictures import COLOURS, legend_below, new_figure
-from apc.tables import TableColumn, Tabled
+from apc.output.pictures import COLOURS, legend_below, new_figure, short_legend
+from apc.support.extension_table import require_extension
+from apc.support.tables import TableColumn, Tabled
 
 if TYPE_CHECKING:
     from apc.haptics.absolute_stability import AbsoluteStability, PassiveMode
-    from apc.haptics.frequency_response import HinfGains, Transparency
+    from apc.haptics.frequency_response import QuasiStaticImpedance, Transparency
 
 Floats = NDArray[np.float64]
 
@@ -43,11 +46,16 @@ SHOWN = 12
 # Digits of a table's numbers, at most.
 DIGITS = 6
 
-MODE_HEADINGS = ("mode", "damping", "required", "reserve", "frequency", "stiffness", "")
+
+MODE_HEADINGS = ("mode", "damping", "required", "reserve", "frequency", "stiffness", "port")
 NONE = "–"
+PORT_LEGEND = (
+    "damping: of each device; required: smallest damping for a passive port",
+    "frequency: of the largest extractable energy; stiffness: static, of the port",
+)
 
 # The instants of the root mean squares of a `H2Gains`.
-NOISE_RMS = "at the ticks, motion between ticks not included"
+NOISE_RMS = "at clock ticks (motion between ticks is not included)"
 
 
 def passive_text(absolute_stability: AbsoluteStability) -> Lines:
@@ -66,56 +74,52 @@ def passive_text(absolute_stability: AbsoluteStability) -> Lines:
         yield from sentences(_worst_lines(absolute_stability, absolute_stability.worst_mode))
     if absolute_stability.why and not absolute_stability.modes:
         yield from sentences(
-            "Take the velocity by a backward difference of samples, as VirtualWall does, or none (damping 0)."
+            "Use a backward difference of samples as the velocity, as VirtualWall does, or no damping."
         )
     yield ""
     clamped = radius_text(absolute_stability.clamped_radius, absolute_stability.clamped_error)
     moves = (
         f"spectral radius {clamped}"
         if absolute_stability.clamped_radius or absolute_stability.clamped_error
-        else "nothing moves"
+        else "no free motion"
     )
-    yield from labelled(("devices clamped", moves), ("proof", str(absolute_stability.proof)))
+    yield from labelled(("clamped devices", moves), ("proof", str(absolute_stability.proof)))
     if absolute_stability.modes:
-        yield ""
-        yield "  damping in N*s/m, frequency in Hz, stiffness in N/m"
-        yield from table([MODE_HEADINGS, *map(_mode, absolute_stability.modes)], "<>>>>><")
+        rows = [MODE_HEADINGS, *map(_mode, absolute_stability.modes)]
+        yield from headed(
+            "Port modes (damping in N*s/m, frequency in Hz, stiffness in N/m)", table(rows, "<>>>>><")
+        )
+        yield from notes(*PORT_LEGEND)
 
 
 def _worst_lines(absolute_stability: AbsoluteStability, worst: PassiveMode) -> str:
     """Return the text on the modes with the most energy output or required damping."""
-    moved = "all alike" if worst.name in ("common", "single") else f"in a {worst.name} mode"
+    mode = "the common mode" if worst.name in ("common", "single") else f"the {worst.name} mode"
     if worst.more is None:
-        held = "with its devices clamped the topology is unstable, and no damping of theirs helps"
-        return f"Devices that move {moved}: {held}."
-    alone = "" if absolute_stability.joined else ", each by itself"
-    enough = f"With {worst.more:.4g} N*s/m more damping at each device they can't"
+        return f"In {mode}, the topology is unstable with clamped devices, whatever their damping."
+    at = f"{worst.frequency_hz:.4g} Hz"
+    enough = f"It becomes passive with {worst.more:.4g} N*s/m of additional damping per device."
     if absolute_stability.stable:
+        operators = "passive operator" if absolute_stability.joined else "independent passive operators"
         return (
-            f"Whatever gives back no more energy than it was given may hold the devices{alone}. Of their "
-            f"damping {-worst.more:.4g} N*s/m could be spared, with the least left as they move {moved} at "
-            f"{worst.frequency_hz:.4g} Hz."
+            f"Absolutely stable with any {operators}. The devices have {-worst.more:.4g} N*s/m of damping in "
+            f"reserve; the reserve is smallest in {mode} at {at}."
         )
     if absolute_stability.clamped_stable is False:
-        return "Hands that hold the devices still are passive, and with these the topology is not stable."
+        return "A clamped device is a passive operator; with it the topology is unstable."
     if absolute_stability.stable is False:
-        return (
-            f"Hands that move the devices {moved} at {worst.frequency_hz:.4g} Hz get energy out of the "
-            "topology "
-            f"for ever, and can make it shake. {enough}."
-        )
+        return f"The port is not passive: in {mode} it is active at {at}. {enough}"
     if worst.passive is False:
         return (
-            f"Hands that move the devices {moved} at {worst.frequency_hz:.4g} Hz get energy out if they are "
-            "joined to each other; as some devices feel others more than those feel them, what hands do each "
-            f"by itself is left open. {enough}."
+            f"In {mode} the port is active at {at} for operators that are coupled to each other. The "
+            f"coupling between devices is not symmetric, so independent passive operators are undecided. "
+            f"{enough}"
         )
-    return (
-        f"Rounding leaves open whether hands get energy out, moving {moved} at {worst.frequency_hz:.4g} Hz."
-    )
+    return f"Undecided: rounding errors exceed the margin of passivity in {mode} at {at}."
 
 
 def _mode(passive_mode: PassiveMode) -> tuple[str, ...]:
+    """Return the cells of a mode's row, in the order of `MODE_HEADINGS`."""
     name = passive_mode.name + (f" × {passive_mode.multiplicity:,}" if passive_mode.multiplicity > 1 else "")
     verdict = {True: "passive", False: "not passive", None: "undecided"}[passive_mode.passive]
     needed = reserve = NONE
@@ -145,61 +149,58 @@ def passive_document(absolute_stability: AbsoluteStability) -> Plain:
 
 
 def transparency_text(transparency: Transparency) -> Lines:
-    """Yield the transparency at a device, in words and numbers."""
-    title = (
-        f"{transparency.topology}: what a hand feels at "
-        f"{transparency.at}{LINEARIZED if transparency.linearized else ''}"
-    )
-    yield from wrapped(title, "", "  ")
-    yield from notes(*transparency.notes, *transparency.limitations)
-    yield ""
+    """Yield the impedance at a device, transmitted velocity, coordination error and norms."""
+    title = f"impedance at {transparency.at}{LINEARIZED if transparency.linearized else ''}"
+    yield from wrapped(f"{transparency.topology}: {title}", "", "  ")
+    yield from notes(*transparency.limitations)
     slow = transparency.low_frequency
     if slow is not None:
-        yield "  Of slow motions, the other hands as the topology has them:"
-        parts = zip(("mass", "damping", "stiffness"), ("kg", "N*s/m", "N/m"), slow.errors, strict=True)
-        for name, unit, error in parts:
-            yield from labelled((name, measured(getattr(slow, name), error, unit)))
-        if (network := transparency.network_damping) is not None:
-            share = measured(network.network, network.error, "N*s/m")
-            yield from labelled(("of that", f"{share}, which the network adds"))
-        if slow.mass < 0:
-            yield from notes("a mass below 0: late forces act as negative inertia, for slow motions")
-        yield ""
-    headings = ("frequency", "impedance", "phase", "arrives", "copies apart", "alias")
-    units = ("Hz", "N*s/m", "degrees", "mm/s/N", "mm/N", "")
-    yield from table([headings, units, *_rows_shown(transparency)], ">>>>>>")
-    legend = [f"arrives: at {transparency.between}"] if transparency.between else []
-    legend += (
-        [f"copies: of {transparency.object}, from the mean of the others'"] if transparency.object else []
+        yield from headed("Low-frequency impedance", _low_frequency_lines(transparency, slow))
+    headings = ("frequency", "impedance", "phase", "transmitted", "coord. error", "alias")
+    units = ("Hz", "N*s/m", "deg", "mm/s/N", "mm/N", "")
+    rows = [headings, units, *_rows_shown(transparency)]
+    yield from headed("Frequency response", table(rows, ">>>>>>"))
+    extension = require_extension("system_norms") if transparency.hinf or transparency.h2 else None
+    norms = (
+        [extension.norm_row(gains) for gains in transparency.hinf]
+        if extension and transparency.stable is not False
+        else []
     )
-    legend += ["alias: the largest part that sampling moves to another frequency, beside that at this one"]
+    if norms:
+        rows = [("mode", "output", "H∞ norm", "frequency"), *norms]
+        yield from headed("Largest gain over frequency, from forces of the hands", table(rows, "<<<>"))
+    noise = [row for gains in transparency.h2 for row in extension.noise_rows(gains)] if extension else []
+    if noise:
+        rows = [("white noise input", "output", "rms"), *noise]
+        yield from headed(f"Response to white noise, {NOISE_RMS}", table(rows))
+    legend = []
+    if transparency.between:
+        legend.append(f"transmitted: velocity at {transparency.between} per unit force")
+    if transparency.object:
+        legend.append(f"coord. error: deviation of {transparency.object} from the mean of the other peers")
+    legend.append("alias: largest aliased component of the motion, relative to the fundamental")
     yield ""
-    yield from sentences("; ".join(legend))
-    if transparency.hinf and transparency.stable is not False:
-        yield "\n  Largest gain at any frequency (H∞), forces of any course:"
-        yield from table([_extreme(extremes) for extremes in transparency.hinf])
-    for noise in transparency.h2:  # of a sample that is off by a mm, a µm is what a mm is of 1 N
-        subject, small = "1 N rms at every hand", "m"
-        if noise.source != "hands":
-            subject, small = "1 mm rms on every device's samples", "µ"
-        values = [
-            f"{quantity} {measured(value * 1e3, off * 1e3, unit)}"
-            for quantity, value, off, unit in (
-                ("copies apart", noise.error_m, noise.errors[0], f"{small}m"),
-                ("velocity", noise.velocity_m_s, noise.errors[1], f"{small}m/s"),
-            )
-            if value is not None and off is not None
-        ]
-        yield ""
-        spread = ", ".join(values) or "it drifts, or rounding hides that it does not"
-        yield from notes(f"{spread}: rms {NOISE_RMS}, for {subject}, white from tick to tick")
+    yield from notes(*legend, *transparency.notes)
+
+
+def _low_frequency_lines(transparency: Transparency, slow: QuasiStaticImpedance) -> Lines:
+    """Yield mass, damping and stiffness of slow motions, the other hands as in the topology."""
+    network = transparency.network_damping
+    parts = zip(("mass", "damping", "stiffness"), ("kg", "N*s/m", "N/m"), slow.errors, strict=True)
+    for name, unit, error in parts:
+        text = with_error(getattr(slow, name), error, unit)
+        if name == "damping" and network is not None:
+            text += f" ({with_error(network.network, network.error, 'N*s/m')} from the network)"
+        if name == "mass" and slow.mass < 0:
+            text += " (delay acts as negative inertia)"
+        yield from labelled((name, text))
 
 
 def _curves(transparency: Transparency) -> list[tuple[NDArray[np.complex128], Floats, float, bool, str]]:
     """Return a response (k,), its relative bounds (k,), a factor, and its name, if present."""
     separation = bool(transparency.object)
     return [
-        (transparency.impedance, transparency.bound, 1.0, True, "impedance (N·s/m)"),
+        (transparency.impedance, transparency.bound, 1.0, True, "impedance [N·s/m]"),
         (
             *(
                 transparency.transmitted_admittance,
@@ -207,14 +208,14 @@ def _curves(transparency: Transparency) -> list[tuple[NDArray[np.complex128], Fl
                 1e3,
                 bool(transparency.between),
             ),
-            f"velocity at {transparency.between} (mm/s/N)",
+            f"velocity at {transparency.between} [mm/s/N]",
         ),
         (
             transparency.coordination_error,
             transparency.error_bound,
             1e3,
             separation,
-            f"copies of {transparency.object} apart (mm/N)",
+            f"coordination error of {transparency.object} [mm/N]",
         ),
     ]
 
@@ -241,17 +242,6 @@ def _rows_shown(transparency: Transparency) -> Iterator[tuple[str, ...]]:
         )
 
 
-def _extreme(extremes: HinfGains) -> tuple[str, str]:
-    """Return a norm and its name."""
-    peak = extremes.sampled_data
-    subject, unit = ("velocity", "m/s/N") if extremes.of == "velocity" else ("copies apart", "m/N")
-    size = "not known: beyond floats" if np.isnan(peak.norm) else "without end: it drifts"
-    if np.isfinite(peak.norm):
-        norm = measured(peak.norm, peak.error + 1e-11 * peak.norm, unit)
-        size = f"{norm} at {peak.frequency_hz:.5g} Hz"
-    return f"{extremes.mode}, {subject}", size
-
-
 def transparency_document(transparency: Transparency) -> Plain:
     """Return the same as plain data, in SI; complex numbers as pairs."""
     instead = {
@@ -263,22 +253,22 @@ def transparency_document(transparency: Transparency) -> Plain:
 
 
 def transparency_picture(transparency: Transparency, kind: str = "bode", ax: Any = None) -> Any:
-    """Draw the impedance, and the transmitted motion, as Bode's plot or Nyquist's; return the Figure.
+    """Draw the impedance and the transmitted motion as a Bode or Nyquist plot; return the Figure.
 
-    Into an `ax` of somebody's, of Bode's plot the magnitudes alone are drawn.
+    Into a given `ax` only the magnitudes of the Bode plot are drawn.
     """
     nyquist, axes = kind == "nyquist", [ax]
     if ax is None:
         figure = new_figure((4.2, 4.0) if nyquist else (5.2, 5.6))
         axes = figure.subplots(1 if nyquist else 2, 1, sharex=True, squeeze=False)[:, 0].tolist()
     size, *phases = axes
-    size.set_title(f"{transparency.topology}: felt at {transparency.at}", fontsize=9)
+    size.set_title(f"{transparency.topology}: impedance at {transparency.at}", fontsize=9)
     if nyquist:
         size.plot(transparency.impedance.real, transparency.impedance.imag, color=COLOURS[0])
         for line in (size.axvline, size.axhline):
             line(0.0, color="#999999", linewidth=0.6)
         size.set_aspect("equal", adjustable="datalim")
-        size.set(xlabel="real part of the impedance (N·s/m)", ylabel="imaginary part (N·s/m)")
+        size.set(xlabel="real part of the impedance [N·s/m]", ylabel="imaginary part [N·s/m]")
         for index, mark in ((0, "o"), (-1, "s")):
             at, label = transparency.impedance[index], f"{transparency.frequency_hz[index]:.3g} Hz"
             size.plot(at.real, at.imag, mark, color=COLOURS[0], markersize=5, label=label)
@@ -288,11 +278,11 @@ def transparency_picture(transparency: Transparency, kind: str = "bode", ax: Any
                 style = {"color": COLOURS[index], "linestyle": ("-", "--", "-.")[index], "label": label}
                 size.loglog(transparency.frequency_hz, scale * np.abs(values), **style)
         size.set_ylabel("magnitude")
-        axes[-1].set_xlabel("frequency (Hz)")
+        axes[-1].set_xlabel("frequency [Hz]")
     for phase in phases:
         degrees = np.degrees(np.angle(transparency.impedance))
         phase.semilogx(transparency.frequency_hz, degrees, color=COLOURS[0])
-        phase.set_ylabel("phase of the impedance (°)")
+        phase.set_ylabel("phase of the impedance [°]")
         if np.abs(degrees).max() <= 90:
             phase.set_yticks(range(-90, 91, 45))
     if ax is None:
@@ -302,7 +292,7 @@ def transparency_picture(transparency: Transparency, kind: str = "bode", ax: Any
             "frameon": False,
             "ncols": 1 + nyquist,
         }
-        size.figure.legend(*size.get_legend_handles_labels(), **beneath)
+        size.figure.legend(*short_legend(*size.get_legend_handles_labels()), **beneath)
     else:
         legend_below(ax, -0.2, ncols=1 + nyquist)
     return size.figure

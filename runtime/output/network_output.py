@@ -17,14 +17,14 @@ from apc.compiler.wording import counted, wrapped
 from apc.output.formatting import LINEARIZED, Lines, Plain, labelled, notes, radius_text, record, sentences
 
 if TYPE_CHECKING:
-    from apc.mean_square.dropout_bounds import ConsecutiveLosses
+    from apc.mean_square.loss_results import ConsecutiveLosses
     from apc.mean_square.mean_square_stability import MeanSquareStability
     from apc.network.link_fit import LinkFit, Share
 
 _WORDS = {
-    True: "Over the network as it is, the mean square of every motion dies out that something holds back.",
-    False: "Over the network as it is, the mean square of some motion grows.",
-    None: "The growth of mean squares lies nearer to 1 than its error bound.",
+    True: "With the packet losses and delays of the network, the second moments of all motions decay{}.",
+    False: "With the packet losses and delays of the network, the second moment of some motion grows.",
+    None: "The second-moment growth is closer to 1 than its error bound.",
 }
 
 
@@ -35,22 +35,20 @@ def network_text(result: MeanSquareStability) -> Lines:
     yield f"{result.topology}: {result.verdict}{where}{LINEARIZED if result.linearized else ''}"
     yield ""
     if radius is not None:
-        yield from sentences(_WORDS[result.stable])
+        yield from sentences(_WORDS[result.stable].format(", apart from free common translations"))
         yield ""
         error, root = result.error or 0.0, math.sqrt(radius)
         rooted = radius_text(root, error / (2 * root) if root else error)
         yield from labelled(
-            ("mean squares", f"multiplied by {radius_text(radius, error)} a frame"),
-            ("their root", f"{rooted}, to compare with a spectral radius"),
+            ("second moments", f"growth {radius_text(radius, error)} per frame (stable < 1)"),
+            ("square root", f"{rooted} (cf. nominal spectral radius)"),
         )
     if result.rms_error_m is not None:
-        separation = (
-            f"{result.rms_error_m * 1e3:.4g} mm rms, for 1 N rms at every hand, white from tick to tick"
-        )
-        yield from labelled(("copies apart", separation))
+        separation = f"{result.rms_error_m * 1e3:.4g} mm rms, for white noise of 1 N rms at every hand"
+        yield from labelled(("coordination error", separation))
     if result.almost_sure is not None:
         low, high = result.almost_sure.interval
-        exponent = f"growth e^{result.almost_sure.exponent:.4g} a frame ({low:.4g} to {high:.4g})"
+        exponent = f"Lyapunov exponent {result.almost_sure.exponent:.4g} per frame ({low:.4g} to {high:.4g})"
         yield from labelled(("almost surely", exponent))
     if result.losses_in_a_row is not None:
         yield from labelled(*_losses(result.losses_in_a_row))
@@ -59,19 +57,17 @@ def network_text(result: MeanSquareStability) -> Lines:
 
 
 def _losses(losses_in_a_row: ConsecutiveLosses) -> Iterator[tuple[str, str]]:
-    if losses_in_a_row.certified is not None:
-        harmless = (
-            f"any pattern of at most {losses_in_a_row.certified}"
-            if losses_in_a_row.certified
-            else "not even one at a time"
-        )
-        yield "losses in a row", f"{harmless} is certified harmless"
+    """Yield the label and the text of each result on consecutive losses."""
+    certified = losses_in_a_row.certified
+    if certified is not None:
+        most = f"certified stable up to {counted(certified, 'consecutive lost packet')}"
+        yield "losses", most if certified else "no loss pattern is certified stable"
     pattern = "".join("×" if lost else "·" for lost in losses_in_a_row.unstable_pattern or ())
-    by = f"by {losses_in_a_row.growth:.6g} a frame" if pattern else ""
+    growth = f"growth {losses_in_a_row.growth:.6g} per frame" if pattern else ""
     if "×" in pattern:
-        yield "worst pattern", f"{pattern} lost again and again (×) makes a motion grow {by}"
+        yield "unstable pattern", f"{pattern}, repeated (× = lost): {growth}"
     elif pattern:
-        yield "losses in a row", f"with none a motion grows {by}"
+        yield "losses", f"unstable without any loss: {growth}"
 
 
 def network_document(result: MeanSquareStability) -> Plain:
@@ -90,10 +86,12 @@ def recording_text(recording: LinkFit) -> Lines:
         yield ""
     yield from labelled(("lost", _share(recording.lost)))
     if recording.lost.count:
-        how = "losses follow losses" if recording.bursty else "no more than luck makes of independent losses"
-        average = f"{recording.lost.count / recording.bursts:.3g} packets on average"
-        bursts = f"{recording.bursts:,}, {average}, {recording.longest_burst:,} the longest"
-        yield from labelled(("bursts", bursts), ("", f"{how} (Fisher's exact test)"))
+        independent = "inconsistent" if recording.bursty else "consistent"
+        mean = recording.lost.count / recording.bursts
+        bursts = f"{recording.bursts:,}, mean length {mean:.3g}, longest {recording.longest_burst:,}"
+        yield from labelled(
+            ("bursts", bursts), ("", f"{independent} with independent losses (Fisher's exact test)")
+        )
     if recording.distribution is not None:
         several = recording.packets > recording.lost.count + 1
         spread = f", standard deviation {_ms(recording.std)}" if several else ""
@@ -103,16 +101,13 @@ def recording_text(recording: LinkFit) -> Lines:
         span = f"{_ms(recording.shortest)} to {_ms(recording.longest)}"
         yield from labelled(("delay", span), ("  mean", f"{_ms(recording.mean)}{spread}"), *quantiles)
     if recording.reordered is not None:
-        yield from labelled(("overtaken", counted(recording.reordered, "packet", ",")))
-    yield "\n  as keys of a link"
-    yield from wrapped(link_entry(recording), "    ", "     ")
+        yield from labelled(("reordered", counted(recording.reordered, "packet", ",")))
+    yield from ("", "Link with the fitted values", "")
+    yield from wrapped(link_entry(recording), "  ", "   ")
     if recording.distribution is not None and recording.distribution.jitter:
-        away = (
-            f"shares of packets below a delay differ by at most {100 * recording.distribution.distance:.2g} %"
-        )
-        nearest = f"{recording.distribution.distribution} is the nearest of the distributions: {away}"
-        yield from wrapped(nearest, "    ", "    ")
-    yield f"  or packet by packet\n    lan: {{clock: network, trace: {file}}}"
+        away = f"the distribution functions differ by at most {100 * recording.distribution.distance:.2g} %"
+        yield from notes(f"best fit: {recording.distribution.distribution}; {away}")
+    yield from ("", "Link with the recorded packets", "", f"  lan: {{clock: network, trace: {file}}}")
 
 
 def recording_document(recording: LinkFit) -> Plain:

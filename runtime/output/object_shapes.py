@@ -1,8 +1,8 @@
 """The bodies of a model and the surfaces between them, determined from its equations.
 
 Takes: a `Model`.
-Gives: `DrawnBody`, `Disc`, `SupportLine`, `PeerView`, `moves_in_plane`, `bodies_of`, `views_of`;
-`positions_of`, `heading`.
+Gives: `DrawnBody`, `Disc`, `SupportLine`, `Contact`, `PeerView`, `moves_in_plane`, `bodies_of`,
+`contacts_of`, `views_of`; `positions_of`, `heading`.
 Guarantees: a body is a position, a number or a vector of numbers in metres, and the angle of the part whose
 position it is; a condition on the distance of two of them, or of one from a fixed point, in metres, gives a
 disc. A condition on the distance from a line or plane, or on an axis from a point, gives a line.
@@ -14,7 +14,8 @@ is sent to the others, or else the second, has the radius w; the other is a poin
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import itertools
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,9 +26,9 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import Model, PeerType
 from apc.compiler.interpolation import jacobian
 from apc.compiler.language.vectors import whole_and_index
-from apc.frame.jacobians import guards_of, jacobians
-from apc.frame.linearize import start_values
-from apc.frame.parameters import resolve
+from apc.linearization.jacobians import guards_of, jacobians
+from apc.linearization.linearize import start_values
+from apc.parameter_values.parameters import resolve
 from apc.simulation.signals import sent_states
 
 Floats = NDArray[np.float64]
@@ -71,12 +72,25 @@ class SupportLine:
 
 
 @dataclass(frozen=True, slots=True)
+class Contact:
+    """A force between a point `holder` and a body `held`: it depends on the difference of their positions.
+
+    `arm` is the grasp point, from the body's centre along its axes, in m; (0, …) is the centre.
+    """
+
+    holder: str
+    held: str
+    arm: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
 class PeerView:
-    """A peer at the start: its bodies, those of a plane only if there are some, and its fixed surfaces."""
+    """A peer at the start: its bodies, those of a plane only if there are some, surfaces and contacts."""
 
     name: str
     bodies: tuple[DrawnBody, ...]
     surfaces: tuple[Disc | SupportLine, ...]
+    contacts: tuple[Contact, ...] = ()
 
 
 def positions_of(peer_type: PeerType) -> dict[str, list[int]]:
@@ -131,7 +145,13 @@ def views_of(system: Model) -> list[PeerView]:
             start, _, _ = start_values(subsystems[members.peer_type], vector)
             bodies, surfaces = bodies_of(system.peer_types[members.peer_type], vector, start)
             shown = tuple(body for body in bodies if not plane or len(body.position) > 1)
-            peer_views.append(PeerView(f"{members.name}[{peer + 1}]", shown, tuple(surfaces)))
+            names = {body.name for body in shown}
+            contacts = tuple(
+                contact
+                for contact in contacts_of(system.peer_types[members.peer_type], vector, start)
+                if {contact.holder, contact.held} <= names
+            )
+            peer_views.append(PeerView(f"{members.name}[{peer + 1}]", shown, tuple(surfaces), contacts))
     return peer_views
 
 
@@ -190,6 +210,66 @@ def bodies_of(
         for turned in [turns.get(part, [])]
     ]
     return bodies, list(fixed)
+
+
+def contacts_of(peer_type: PeerType, vector: Sequence[float], start: Sequence[float]) -> list[Contact]:
+    """Return the forces between two bodies of a peer, in its initial state.
+
+    A force K(x₁ − x₂ − R(φ) p) has opposite slopes over the two positions, and the slope −K R'(φ) p over the
+    angle of the second body, by which its arm p is determined.
+
+    Parameters
+    ----------
+    peer_type, vector, start
+        As for `bodies_of`.
+    """
+    positions, turns = positions_of(peer_type), rotations_of(peer_type)
+    result: dict[Contact, None] = {}
+    for slopes in _slopes_at(peer_type, vector, start):
+        for first, second in itertools.permutations(positions, 2):
+            one, two = positions[first], positions[second]
+            turned = turns.get(second.rpartition(".")[0], [])
+            if len(one) != len(two) or len(one) == 3 or turns.get(first.rpartition(".")[0]):
+                continue
+            scale = np.abs(slopes[:, one]).max(initial=0.0)
+            rows = (np.abs(slopes[:, one] + slopes[:, two]) <= SAME * scale).all(axis=1)
+            rows &= (np.abs(slopes[:, one]) > SAME * scale).any(axis=1)
+            stiffness = slopes[rows][:, two]
+            if not scale or np.linalg.matrix_rank(stiffness) < len(one):
+                continue
+            arm = np.zeros(len(one))
+            if turned:
+                angle = start[turned[0]]
+                turn = np.array([[-np.sin(angle), -np.cos(angle)], [np.cos(angle), -np.sin(angle)]])
+                arm = turn.T @ np.linalg.lstsq(stiffness, slopes[rows, turned[0]], rcond=None)[0]
+            elif _is_reversed(result, first, second):
+                continue
+            holder, held = (name.rpartition(".")[0] for name in (first, second))
+            result[Contact(holder, held, tuple(map(_tidy, arm)))] = None
+    return list(result)
+
+
+def _is_reversed(contacts: Iterable[Contact], first: str, second: str) -> bool:
+    """Return whether a contact between two positions is there, with the second as the holder."""
+    pair = (second.rpartition(".")[0], first.rpartition(".")[0])
+    return any((contact.holder, contact.held) == pair for contact in contacts)
+
+
+def _slopes_at(peer_type: PeerType, vector: Sequence[float], start: Sequence[float]) -> Iterator[Floats]:
+    """Yield the slopes (k, n_x) over the states of the derivative and of the clocks' outputs."""
+    for function in (peer_type.derivative, *(clock.tick for clock in peer_type.clocks)):
+        if not function.is_a("SXFunction"):
+            continue
+        inputs: list[Any] = function.sx_in()
+        outputs = function(*inputs)
+        whole = casadi.vertcat(*outputs) if isinstance(outputs, tuple | list) else outputs
+        slopes = casadi.Function(
+            "slopes", inputs, [casadi.densify(jacobian(casadi.densify(whole), inputs[0]))]
+        )
+        values = [start, *(np.zeros(one.shape) for one in inputs[1:-2]), vector, 0.0]
+        found = np.asarray(slopes(*values), np.float64)
+        if np.isfinite(found).all():
+            yield found
 
 
 def _decisions(peer_type: PeerType, vector: Sequence[float]) -> Iterator[tuple[Floats, Floats, Floats]]:

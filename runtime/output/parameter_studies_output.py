@@ -14,9 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from numpy.typing import NDArray
 
-from apc.compiler.wording import counted, in_hertz, known_digits, with_unit, wrapped
-from apc.frame.display_units import as_shown
-from apc.optional import need
+from apc.compiler.wording import counted, in_hertz, with_unit, wrapped
 from apc.output.formatting import (
     MEANT,
     Lines,
@@ -30,82 +28,84 @@ from apc.output.formatting import (
     table,
     uncertain,
 )
-from apc.parameter_studies.crossing import PERIOD
+from apc.parameter_values.display_units import as_shown
+from apc.studies.crossing import PERIOD
+from apc.support.optional import need
 
 if TYPE_CHECKING:
     import pandas
 
-    from apc.frame.parameter_listing import Parameters, Settable
-    from apc.parameter_studies.batch_analysis import Analyses
-    from apc.parameter_studies.critical_values import Critical
-    from apc.parameter_studies.crossing import Crossing
-    from apc.parameter_studies.margins import Margins
-    from apc.parameter_studies.sensitivity import Sensitivities
-    from apc.sweeps.resumable_sweep import Sweep
+    from apc.parameter_values.parameter_listing import Parameters, Settable
+    from apc.studies.batch_analysis import Analyses
+    from apc.studies.critical_values import Critical
+    from apc.studies.crossing import Crossing
+    from apc.studies.resumable_sweep import Sweep
 
 ROUGH = 1e-2  # of a value: its error is then said to be no slip
 SHOWN = 6  # rows of the table of sensitivities; digits of a value in a sentence
 
-# A relative change of the radius below this, for a relative change of 1 in a parameter, is indistinguishable
-# from rounding.
-LEAST_CHANGE = 1e-9
 
-NONE_REPORTED = "what moves the radius most: no change of it can be told from rounding"
-
-HOW = (
-    '--set NAME="VALUE UNIT" sets one, in every command that analyses; words, as of a type, stand in the file'
-)
+HOW = 'Set a parameter with --set NAME="VALUE UNIT". Options, such as types, are set in the file.'
 
 
 def critical_text(critical: Critical) -> Lines:
-    """Yield the critical values of a parameter."""
+    """Yield the critical values of a parameter: the stable range, a table, the search."""
     unit = critical.unit
-    now = quantity(critical.current, unit)
-    if critical.groups:
-        values = [
-            "several values" if value is None else quantity(value, unit) for _, value in critical.groups
-        ]
-        now = ", ".join(
-            f"{value} at {group}" for value, (group, _) in zip(values, critical.groups, strict=True)
-        )
-        now += f", to be one value for all {'groups' if len(critical.groups) > 1 else 'its peers'}"
     text = _stable_ranges(critical)
     if not text:
         text = str(critical.verdict or "")
         if critical.counted and critical.verdict and critical.has_effect:
-            text = f"{critical.verdict.word} at every number looked at"
-    yield from wrapped(f"{critical.topology}: {text}")
-    meant = MEANT.get(critical.criterion, "")
-    yield from notes(meant, *critical.limitations, f"{critical.parameter} is now {now}")
+            text = f"{critical.verdict.word} at every evaluated number"
+    yield from wrapped(f"{critical.topology}: {text}", "", "  ")
+    yield from notes(MEANT.get(critical.criterion, ""), *critical.limitations)
     yield ""
-    if not critical.has_effect:
-        return
-    if critical.counted:
+    if critical.counted and critical.has_effect:
         yield from _count_lines(critical)
-        return
-    for crossing in critical.crossings:
-        yield f"  {uncertain(crossing.value, crossing.error, unit)}"
-        turns = "" if math.isnan(crossing.frequency_hz) else f", {in_hertz(crossing.frequency_hz)}"
-        yield f"    {_sides(crossing)}{turns}, {crossing.proof}"
-        if crossing.kind == PERIOD:
-            yield from sentences(
-                "periods in the middle of this range make frames of too many ticks with the other clocks"
-            )
-        elif crossing.error > ROUGH * abs(crossing.value):
-            yield "    no narrower: within its error the bounds on growth leave the verdict open"
-    if critical.crossings:
+    elif critical.crossings:
+        rows = [("critical value", "stable side", "frequency", "proof")]
+        for crossing in critical.crossings:
+            value = uncertain(crossing.value, crossing.error, unit)
+            rows.append((value, _sides(crossing), in_hertz(crossing.frequency_hz), str(crossing.proof)))
+        yield from table(rows, "<<><")
         yield ""
-    yield f"  scanned {_span(critical.searched_to, unit)}"
-    yield f"  {counted(critical.evaluations, 'value')} looked at: two crossings near to each other could hide"
+    yield from sentences(f"current value: {_present_value(critical)}")
+    if not critical.has_effect or critical.counted:
+        return
+    searched = f"searched: {_span(critical.searched_to, unit)}, {counted(critical.evaluations, 'value')}"
+    yield from sentences(f"{searched}; two close crossings could be missed")
+    if any(crossing.kind == PERIOD for crossing in critical.crossings):
+        yield from sentences(
+            "periods inside the range lead to a frame of too many ticks with the other clocks"
+        )
+    if any(
+        crossing.kind != PERIOD and crossing.error > ROUGH * abs(crossing.value)
+        for crossing in critical.crossings
+    ):
+        yield from sentences(
+            "no narrower bound: within its error the growth bounds do not decide the verdict"
+        )
     if critical.isolated:
         ends = " and ".join(quantity(value, unit) for value in critical.isolated)
-        yield from sentences(f"at {ends} the verdict differs from that at all neighbouring values")
+        yield from sentences(f"at {ends} the verdict differs from all neighbouring values")
     if critical.undecided:
         parts = ", ".join(_span(pair, unit) for pair in critical.undecided[:SHOWN])
-        rest = f" and {len(critical.undecided) - SHOWN} more" if len(critical.undecided) > SHOWN else ""
-        yield from sentences(f"the verdict is left open {parts}{rest}")
+        rest = (
+            f" and {len(critical.undecided) - SHOWN} more ranges" if len(critical.undecided) > SHOWN else ""
+        )
+        yield from sentences(f"undecided: {parts}{rest}")
     if not critical.complete:
-        yield "  an eigenvalue keeps near to the boundary: more crossings could hide"
+        yield from sentences("an eigenvalue stays close to the unit circle; more crossings could be missed")
+
+
+def _present_value(critical: Critical) -> str:
+    """Return the present value of a parameter; of a parameter with values by group, each of them."""
+    if not critical.groups:
+        return quantity(critical.current, critical.unit)
+    values = ", ".join(
+        f"{'several values' if value is None else quantity(value, critical.unit)} at {group}"
+        for group, value in critical.groups
+    )
+    return f"{values}; varied as one value for all {'groups' if len(critical.groups) > 1 else 'peers'}"
 
 
 def _stable_ranges(critical: Critical) -> str:
@@ -133,11 +133,11 @@ def _stable_ranges(critical: Critical) -> str:
 
 
 def _sides(crossing: Crossing) -> str:
-    """Return the stable side of a crossing; of a jump, the verdict at its own value, too."""
+    """Return the stable side of a crossing; of a jump, whether its value is stable."""
     if crossing.kind != "jump":
-        return f"stable {crossing.stable_side} it"
-    at = {True: ", stable at it", False: ", unstable at it", None: ""}[crossing.stable_at]
-    return f"jump{at}, stable {crossing.stable_side} it"
+        return crossing.stable_side
+    included = {True: " (jump, inclusive)", False: " (jump, exclusive)", None: " (jump)"}
+    return f"{crossing.stable_side}{included[crossing.stable_at]}"
 
 
 def _on_stable_side(value: float, error: float, side: str) -> float:
@@ -151,7 +151,10 @@ def _on_stable_side(value: float, error: float, side: str) -> float:
 
 
 def _span(ends: tuple[float, float], unit: str) -> str:
-    return f"from {quantity(ends[0], unit)} to {quantity(ends[1], unit)}"
+    """Return the text of a range, or of its only value."""
+    if ends[0] == ends[1]:
+        return quantity(ends[0], unit)
+    return f"{quantity(ends[0], unit)} to {quantity(ends[1], unit)}"
 
 
 def _count_lines(critical: Critical) -> Lines:
@@ -172,12 +175,11 @@ def _count_lines(critical: Critical) -> Lines:
     if lines:
         yield from table(lines)
         yield ""
-    evaluations = f"every number from {first:,d} to {last:,d} was looked at"
+    evaluations = f"every number from {first:,d} to {last:,d} was evaluated"
     if critical.evaluations != last - first + 1:
         evaluations = (
-            f"{critical.evaluations} numbers from {first:,d} to {last:,d} were looked at, those on "
-            "either side of "
-            "a change among them; a change and back between two could hide"
+            f"{critical.evaluations} numbers from {first:,d} to {last:,d} were evaluated, including those on "
+            "both sides of each change; a change and its reverse between two of them could be missed"
         )
     yield from sentences(evaluations)
 
@@ -185,7 +187,7 @@ def _count_lines(critical: Critical) -> Lines:
 def critical_picture(critical: Critical, ax: Any) -> Any:
     """Draw where the eigenvalues go; return the matplotlib Axes."""
     from apc.output.analysis_output import locus_picture
-    from apc.parameter_studies.root_locus import root_locus
+    from apc.studies.root_locus import root_locus
 
     return locus_picture(root_locus(critical.system, critical), ax)
 
@@ -193,66 +195,6 @@ def critical_picture(critical: Critical, ax: Any) -> Any:
 def critical_document(critical: Critical) -> Plain:
     """Return the critical values of a parameter as plain data."""
     return record(critical, {"verdict": critical.verdict or "", "groups": dict(critical.groups)})
-
-
-def margins_text(margins: Margins) -> Lines:
-    """Yield the table of the margins, of at most 80 columns."""
-    if not margins.rows:
-        yield from notes(f"margins {margins.note}")
-        return
-    width = max(len(row.parameter) for row in margins.rows)
-    ends = []
-    for row in margins.rows:
-        value, error = row.value or 0.0, row.error or 0.0
-        by, shown = as_shown(value, row.unit)
-        ends.append("" if row.value is None else with_unit(known_digits(value * by, error * by, 7), shown))
-    wide = max(16, *map(len, ends))
-    yield f"  {'may grow':<{width}}  from           {'to':<{wide}} times  at"
-    for row, end in zip(margins.rows, ends, strict=True):
-        times = "–" if row.gain_margin is None else f"{row.gain_margin:.4g}"
-        at = in_hertz(math.nan if row.frequency_hz is None else row.frequency_hz)
-        text = f"{end:<{wide}} {times:>5}  {at}{', jump' if row.kind == 'jump' else ''}"
-        if row.note:
-            text = f"not looked for: {row.note}"
-        elif row.value is None:
-            text = f"none found up to {quantity(row.searched_to, row.unit, 5)}"
-        yield f"  {row.parameter:<{width}}  {quantity(row.current, row.unit, 5):<14} {text}"
-    yield from notes(margins.note)
-
-
-def margins_document(margins: Margins) -> Plain:
-    """Return the margins as plain data."""
-    return {"margins": document(margins.rows), "note": margins.note}
-
-
-def sensitivities_text(sensitivities: Sensitivities) -> Lines:
-    """Yield the table of sensitivities, of at most 80 columns."""
-    # Eigenvalues that share the radius often have equal sensitivities; then one row is sufficient.
-    same: dict[tuple[str, str, str], list[str]] = {}
-    for row in sensitivities.rows:
-        if abs(row.relative) > LEAST_CHANGE * sensitivities.radius:
-            key = (row.parameter, f"{quantity(row.value, row.unit):<15}", f"{row.relative / 100:+.2e}")
-            same.setdefault(key, []).append(str(row.mode + 1))
-    if not same:
-        text = sensitivities.note if len(sensitivities.active) < 2 else ""
-        yield from notes(text or NONE_REPORTED)
-        return
-    rows: list[tuple[str, ...]] = [("what moves it most", f"{'value':<15}", "per percent")]
-    for (*cells, change), modes in list(same.items())[:SHOWN]:
-        which = f"  mode {', '.join(modes)}" if len(modes) < len(sensitivities.active) else ""
-        rows.append((*cells, change + which))
-    yield from table(rows)
-    yield from notes(sensitivities.note)
-
-
-def sensitivities_document(sensitivities: Sensitivities) -> Plain:
-    """Return the derivatives as plain data."""
-    return {
-        "spectral_radius": sensitivities.radius,
-        "active": [{"eigenvalue": document(value), "system": name} for value, name in sensitivities.active],
-        "derivatives": document(sensitivities.rows),
-        "note": sensitivities.note,
-    }
 
 
 def analyses_text(analyses: Analyses) -> Lines:
@@ -278,6 +220,7 @@ def analyses_table(analyses: Analyses) -> pandas.DataFrame:
 
 
 def _analyses_columns(analyses: Analyses) -> dict[str, NDArray[Any]]:
+    """Return the columns of a table of analyses by heading: the parameters, then the results."""
     columns = {
         "verdict": analyses.verdict,
         "spectral_radius": analyses.spectral_radius,
@@ -330,9 +273,9 @@ def sweep_table(sweep: Sweep) -> pandas.DataFrame:
 
 def parameters_text(parameters: Parameters) -> Lines:
     """Yield a line per parameter: name, value, limits, and description."""
-    yield f"{parameters.topology}: what may be set\n"
+    yield f"{parameters.topology}: parameters\n"
     rows = [(row.name, _value(row), _limits(row), _crossing_rows(row)) for row in parameters.rows]
-    yield from table([("name", "value", "limits", ""), *rows], later=6)
+    yield from table([("name", "value", "limits", "description"), *rows])
     yield ""
     yield from sentences(HOW)
 
@@ -344,6 +287,7 @@ def _value(settable: Settable) -> str:
 
 
 def _limits(settable: Settable) -> str:
+    """Return the bounds of a parameter in its unit for display: "> 0, ≤ 5"."""
     by, _ = as_shown(max(abs(settable.low), abs(settable.high)), settable.unit)
     low = (
         ""
@@ -355,6 +299,6 @@ def _limits(settable: Settable) -> str:
 
 
 def _crossing_rows(settable: Settable) -> str:
-    fixed = f"not to be set: {settable.fixed}" if settable.fixed else ""
+    fixed = f"fixed: {settable.fixed}" if settable.fixed else ""
     follows = f"follows: {settable.follows}" if settable.follows else ""
     return "; ".join(part for part in (settable.description, follows, fixed) if part)

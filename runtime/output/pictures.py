@@ -1,8 +1,9 @@
 """Common functions of pictures: formats, and writing of figures.
 
 Takes: a matplotlib Figure and a path.
-Gives: `COLOURS`, `LINES`, `colours_of`, `new_figure`, `legend_below`; `FORMATS`, `RESULTS`, `check_picture`,
-`write_figure`, `write_picture`, `write_result`, `table_of`, `svg_text`, `svg_image`, `html_of`.
+Gives: `COLOURS`, `LINES`, `colours_of`, `new_figure`, `legend_below`, `short_legend`, `notes_below`,
+`prefixed`, `scale_ticks`; `FORMATS`, `RESULTS`, `check_picture`, `write_figure`, `write_picture`,
+`write_result`, `table_of`, `svg_text`, `svg_image`, `html_of`.
 Guarantees: the same figure gives the same bytes; a file is there whole or not at all; text in an SVG is text.
 Does not: draw, or need a display.
 
@@ -14,6 +15,7 @@ from __future__ import annotations
 import base64
 import io
 import re
+import textwrap
 from collections.abc import Callable, Sequence
 from html import escape
 from pathlib import Path
@@ -22,11 +24,12 @@ from typing import TYPE_CHECKING, Any
 from apc.compiler.errors import ApcError
 from apc.compiler.files import check_target, write_file, write_text
 from apc.compiler.timings import part
-from apc.distribution import program_version
-from apc.optional import need
 from apc.output.formatting import json_text
-from apc.suffixes import check_suffix
-from apc.tables import SUFFIXES, blocks_of, check_table_path, write_table
+from apc.parameter_values.display_units import as_shown
+from apc.support.distribution import program_version
+from apc.support.optional import need
+from apc.support.suffixes import check_suffix
+from apc.support.tables import SUFFIXES, blocks_of, check_table_path, write_table
 
 if TYPE_CHECKING:
     import pandas
@@ -36,6 +39,10 @@ if TYPE_CHECKING:
 FORMATS = (".png", ".svg", ".pdf")
 RESULTS = (*SUFFIXES, ".json")  # what a result that has a picture can be written as, too
 DPI = 150
+MOST_ENTRIES = 6  # of a legend
+NOTES = "notes"  # the group of the notes below a figure, which can be omitted
+PREFIXES = {-6: "µ", -3: "m", 0: "", 3: "k", 6: "M", 9: "G"}
+LEAST, MOST = 0.5, 1e4  # largest number of an axis: its tick labels are then between 0.1 and 10,000
 SVG = {"svg.hashsalt": "apc", "svg.fonttype": "none"}  # the same names inside it; text is text
 
 # Colours distinct in print and for colour-blind eyes (Okabe and Ito, 2008), without the yellow, which white
@@ -67,7 +74,57 @@ def new_figure(size: tuple[float, float]) -> Any:
 def legend_below(ax: Any, index: float = -0.14, fontsize: float = 8, ncols: int = 2) -> None:
     """Put the legend below an Axes, over nothing; `index` is in heights of the Axes, from its lower edge."""
     style = {"ncols": ncols, "fontsize": fontsize, "frameon": False}
-    ax.legend(loc="upper center", bbox_to_anchor=(0.5, index), **style)
+    handles, labels = short_legend(*ax.get_legend_handles_labels())
+    ax.legend(handles, labels, loc="upper center", bbox_to_anchor=(0.5, index), **style)
+
+
+def short_legend(handles: Sequence[Any], labels: Sequence[str], of: int = 0) -> tuple[list[Any], list[str]]:
+    """Return the first entries of a legend, and an entry with the number of the others, of `of` in all."""
+    left = max(len(labels), of) - MOST_ENTRIES
+    if left <= 0:
+        return list(handles), list(labels)
+    empty = need("matplotlib.lines", "plot").Line2D([], [], linestyle="none")
+    return [*handles[:MOST_ENTRIES], empty], [*labels[:MOST_ENTRIES], f"... and {left} more"]
+
+
+def notes_below(figure: Any, texts: Sequence[str]) -> None:
+    """Put notes below all panels of a figure, each once, wrapped to its width."""
+    letters = int(13 * figure.get_figwidth())
+    sentences = [text[:1].upper() + text[1:] for text in dict.fromkeys(texts)]
+    lines = [line for text in sentences for line in textwrap.wrap(text, letters)]
+    if lines:
+        style = {"x": 0.01, "ha": "left", "fontsize": 7.5, "color": "0.3", "gid": NOTES}
+        figure.supxlabel("\n".join(lines), **style)
+
+
+def prefixed(largest: float, unit: str) -> tuple[float, str]:
+    """Return the factor from SI to the unit of an axis, and that unit.
+
+    The unit is that of the topology, or the SI unit with a prefix, such that `largest`, the largest magnitude
+    on the axis, is at most 10,000 and its tick labels are not below 0.1.
+    """
+    exact, shown = as_shown(largest, unit)
+    factor = float(exact)
+    if not largest or LEAST <= largest * factor <= MOST or shown in ("1", "%"):
+        return factor, shown
+    base, size = (("g", 1e3) if unit.startswith("kg") else (unit[:1], 1.0)) if unit else ("", 1.0)
+    if not base.isalpha():
+        return factor, shown
+    fitting = [power for power in PREFIXES if LEAST <= largest * size / 10.0**power <= MOST]
+    if not fitting:
+        return factor, shown
+    power = min(fitting, key=abs)
+    rest = unit[2:] if unit.startswith("kg") else unit[1:]
+    return size / 10.0**power, f"{PREFIXES[power]}{base}{rest}"
+
+
+def scale_ticks(axis: Any, low: float, high: float, factor: float) -> None:
+    """Label an axis of data in SI, from `low` to `high`, in a unit that is `factor` times as many."""
+    ticker = need("matplotlib.ticker", "plot")
+    values = ticker.MaxNLocator(6, steps=[1, 2, 2.5, 5, 10]).tick_values(low * factor, high * factor) / factor
+    margin = (high - low) * 1e-9
+    axis.set_major_locator(ticker.FixedLocator([v for v in values if low - margin <= v <= high + margin]))
+    axis.set_major_formatter(ticker.FuncFormatter(lambda value, _: f"{value * factor:.6g}"))
 
 
 def colours_of(count: int) -> list[Any]:

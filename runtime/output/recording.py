@@ -23,13 +23,13 @@ from numpy.typing import NDArray
 
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.files import Temporary, begin_file, drop_file, finish_file, is_special, partial_name
-from apc.memory import refuse_beyond
 from apc.output.simulation_output import provenance_json
 from apc.simulation.output_blocks import OutputBlock
 from apc.simulation.simulation import Simulation
 from apc.simulation.trajectory import provenance_of
-from apc.suffixes import check_suffix
-from apc.tables import ENDS, LETTER, WRITERS, TableColumn, TableWriter
+from apc.support.memory import refuse_beyond
+from apc.support.suffixes import check_suffix
+from apc.support.tables import ENDS, LETTER, WRITERS, TableColumn, TableWriter
 
 Floats = NDArray[np.float64]
 
@@ -161,9 +161,10 @@ class Recording:
                 done += step
 
     def close(self, *, partial: bool = False) -> None:
-        """Finish the file and give it its name; `partial` if not all is in it. Raises ApcError (E879).
+        """Finish the file and give it its name; without a written row, delete it.
 
-        Without a row there is no file, and once closed it stays so.
+        `partial` states that blocks are missing: the name is then NAME.partial.csv etc. Later calls have no
+        effect. Raises ApcError (E879) if the file cannot be written.
         """
         if not self._writer.whole_rows:
             self.discard()
@@ -173,8 +174,8 @@ class Recording:
             self._writer.finish()
             if partial:
                 self.path = partial_name(self.path)
-            for temporary, added in [*self._files.items()]:
-                finish_file(temporary, self._part_path(added))
+            for temporary, suffix in [*self._files.items()]:
+                finish_file(temporary, self._part_path(suffix))
                 del self._files[temporary]
         except OSError as error:
             self.discard()
@@ -236,7 +237,7 @@ def open_recording(path: Path, simulation: Simulation) -> Recording:
         each += IN_PARQUET[0] + IN_PARQUET[1] * -(-simulation.rows // block)
     needed, contents = columns * each, f"{simulation.rows:,} rows of {columns:,} columns in {path.name}"
     refuse_beyond(
-        needed, "E876", SourceLocation(simulation.system.origin.topology), contents, "fewer --signals"
+        needed, "E876", SourceLocation(simulation.system.origin.topology), contents, "record fewer --signals"
     )
     return Recording(path, simulation)
 

@@ -14,12 +14,25 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.wording import counted, known_digits, measured
-from apc.frame.display_units import as_shown
+from apc.compiler.wording import counted, known_digits
 from apc.output.analysis_output import range_document
-from apc.output.formatting import MEANT, Lines, Plain, notes, picked, quantity, sentences, span, table
+from apc.output.formatting import (
+    MEANT,
+    Lines,
+    Plain,
+    headed,
+    labelled,
+    notes,
+    picked,
+    quantity,
+    sentences,
+    span,
+    table,
+    with_error,
+)
 from apc.output.region_picture import panel_letter, panels_picture, region_picture  # noqa: F401 -- looked up
-from apc.tables import Row, TableColumn, Tabled
+from apc.parameter_values.display_units import as_shown
+from apc.support.tables import Row, TableColumn, Tabled
 
 if TYPE_CHECKING:
     from apc.regions.panels import Panel, Panels
@@ -39,42 +52,47 @@ def region_text(region: Region) -> Lines:
     ]
     off, percent = region.stable_area_error, 100 / float(region.rectangle.width.prod())
     share = known_digits(percent * region.stable_area, percent * off, 4)
-    area = measured(region.stable_area, off) if off else f"{region.stable_area:.9g}"
+    area = with_error(region.stable_area, off, _product(region.x.unit, region.y.unit))
     yield f"{region.topology}: {_words(region)}"
     yield from notes(MEANT.get(region.criterion, ""), *region.limitations)
     yield ""
-    yield from table(axes)
-    yield f"\n  stable area  {area} in SI, {share} % of the rectangle"
+    yield from table([("axis", "parameter", "range"), *axes])
+    yield ""
+    yield from labelled(("stable area", f"{share} % of the rectangle ({area})"))
     if region.curves:
-        yield ""
-        rows = [("boundary", "frequency [Hz]", "from (x, y)", "to (x, y)", "error")]
-        yield from table([*rows, *(_row(region, curve) for curve in region.curves[:MOST_CURVES])])
+        rows = [("mode", "frequency [Hz]", "from (x, y)", "to (x, y)", "rel. error")]
+        curves = [*rows, *(_row(region, curve) for curve in region.curves[:MOST_CURVES])]
+        yield from headed("Boundary curves", table(curves))
         left = len(region.curves) - MOST_CURVES
         if left > 0:
-            yield f"  and {left} more (--json lists all)"
+            yield f"  {left} more curves not shown (--json)"
     if coarse := region.coarse:
         most, many = max(curve.error for curve in coarse), counted(len(coarse), "curve")
         yield ""
         yield from sentences(
-            f"{many} could not be followed to {region.tolerance:.0e} of a coordinate, but to {most:.0e}"
+            f"relative error of {many}: {most:.0e}, above the requested {region.tolerance:.0e}"
         )
     sizes = zip(region.cell, (region.x, region.y), strict=True)
     cell = " × ".join(quantity(size, axis.unit, 4) for size, axis in sizes)
-    evaluations = f"Looked at in cells of {cell}, and finer where the eigenvalues hint at more; "
     yield ""
-    yield from sentences(f"{evaluations}an island inside one cell could be missed.")
+    yield from sentences(f"Stable or unstable regions smaller than a cell of {cell} could be missed.")
     if region.stepped and region.criterion == "passive":
-        yield "  Its points are on the boundary, with straight lines between; the error is an"
-        yield "  estimate by how far the middles of these were off, no bound."
+        yield from sentences(
+            "The points of a curve are on the boundary and connected by straight lines; the error is an "
+            "estimate from the midpoints of these lines, not a bound."
+        )
     elif region.stepped:
-        yield "  Along these times the boundary has steps: it is right to a cell only."
+        yield from sentences("The boundary has steps along a time axis; it is accurate to one cell.")
 
 
 def _words(region: Region) -> str:
+    """Return in words where a region is stable, and of how many curves its boundary consists."""
     if region.curves:
         closed = sum(curve.closed for curve in region.curves)
-        pieces = "one piece" if len(region.curves) == 1 else f"{len(region.curves)} pieces"
-        return f"the stable region has a boundary in {pieces}" + (f", {closed} closed" if closed else "")
+        pieces = counted(len(region.curves), "curve")
+        return f"stable in a part of the rectangle, boundary: {pieces}" + (
+            f" ({closed} closed)" if closed else ""
+        )
     return "stable in the whole rectangle" if region.corner else "stable nowhere inside the rectangle"
 
 
@@ -123,7 +141,7 @@ def panels_text(panels: Panels) -> Lines:
         for region, gain in zip(panel.regions, panel.gains, strict=True):
             yield from region_text(region)
             if gain != 1:
-                yield f"  Compared at equal effective gain: y counts {gain} times, once an other."
+                yield f"  Normalized to equal effective gain: y is multiplied by {gain}."
             yield ""
 
 
@@ -135,6 +153,7 @@ def panels_document(panels: Panels) -> Plain:
 
 
 def _panel_document(panel: Panel) -> Plain:
+    """Return a panel as plain data: its regions, with the factor of y, and its overlays."""
     return {
         "panel": panel.title,
         "regions": [

@@ -24,25 +24,25 @@ import msgspec
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.files import RefusedError, check_target, read_file, unwritable, write_file, write_text
 from apc.compiler.timings import part
-from apc.optional import missing, need
 from apc.output.formatting import Lines, Plain, json_text, notes, record
 from apc.output.graph import graph_picture
 from apc.output.pages import inert, page
 from apc.reports.contents import Report, Section
-from apc.suffixes import check_suffix
+from apc.support.optional import missing, need
+from apc.support.suffixes import check_suffix
 
 FORMATS = (".html", ".pdf")
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome", "msedge")
 PRINTED = 120.0  # seconds that a browser may take
 LARGEST = 200 * 2**20  # bytes of a report that is read again
 TITLES = {
-    "compiled": "What was compiled",
+    "compiled": "Model",
     "verdict": "Verdict, modes and margins",
-    "limits": "How stiff, how late",
-    "region": "Where it is stable",
-    "response": "What happens over time",
-    "network": "How much may get lost",
-    "transparency": "What a hand feels",
+    "limits": "Stiffness and delay limits",
+    "region": "Stable region",
+    "response": "Response",
+    "network": "Packet loss limit",
+    "transparency": "Impedance",
 }
 # Fields that differ between runs, between machines, or with the order of equal modes.
 UNLIKE = {"provenance", "origin", "points", "handles", "participation"}
@@ -113,10 +113,11 @@ def check_report_path(path: Path) -> None:
 
 
 def _browser(path: Path) -> str:
+    """Return the path of an installed Chromium; an error E875 without one. `path` is the .pdf to write."""
     result = next((text for name in BROWSERS if (text := shutil.which(name))), None)
     if result is None:
-        hint = f"--out {path.with_suffix('.html')}, or install it, as by: apt install chromium"
-        raise missing("Chromium is not installed, which prints a .pdf", hint)
+        fix = f"--out {path.with_suffix('.html')}, or apt install chromium"
+        raise missing("Chromium is not installed, which prints a .pdf", fix)
     return result
 
 
@@ -223,7 +224,7 @@ def damaged(path: Path, message: str = "is no report that apc has written, or is
     """Return the message E990 of a page."""
     return ApcError(
         Diagnostic(
-            "E990", SourceLocation(str(path)), message, hint="apc report topology.yaml --out report.html"
+            "E990", SourceLocation(str(path)), message, fix="apc report topology.yaml --out report.html"
         )
     )
 

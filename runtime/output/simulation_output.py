@@ -20,8 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.language.vectors import entry, whole_and_index
-from apc.compiler.wording import counted, in_hertz, measured, wrapped
-from apc.optional import need
+from apc.compiler.wording import counted, measured
 from apc.output.formatting import (
     Lines,
     Plain,
@@ -34,14 +33,14 @@ from apc.output.formatting import (
     sentences,
     table,
 )
-from apc.output.pictures import colours_of, new_figure
+from apc.output.pictures import colours_of, new_figure, short_legend
 from apc.simulation.motion_classes import MotionVerdict
 from apc.simulation.settings import EXACT
+from apc.support.optional import need
 
 if TYPE_CHECKING:
     from apc.simulation.accuracy import ErrorEstimate
     from apc.simulation.decay import Fit, Oscillation
-    from apc.simulation.limit_cycle import LimitCycle
     from apc.simulation.monte_carlo import Ensemble, MeanSquare
     from apc.simulation.signals import Signal
     from apc.simulation.trajectory import Provenance, SimulationReport, Trajectory
@@ -51,8 +50,9 @@ Floats = NDArray[np.float64]
 LABELS = {
     "settled": "settling time [s]",
     "largest_force": "largest force [N]",
-    "copy_error": "copies apart [m]",
+    "copy_error": "coordination error [mm]",
 }
+MILLIMETRES = 1e3
 # By unit: the panel's title, the displayed unit, and its number per SI unit.
 QUANTITIES = {
     "m": ("position", "mm", 1e3),
@@ -72,38 +72,15 @@ WIDTH, HEIGHT = 9.0, 2.4  # inches: of the figure, of a panel
 PATHS = 2.0  # times as high is a plane
 _WORDS = {
     MotionVerdict.AT_REST: "No {position} changes.",
-    MotionVerdict.DECAYS: "The motion decays.",
-    MotionVerdict.OSCILLATES: "At the end an oscillation neither decays nor grows.",
+    MotionVerdict.DECAYS: "Every {position} converges to a constant value.",
+    MotionVerdict.OSCILLATES: "The final oscillation neither decays nor grows.",
     MotionVerdict.DIVERGES: "The motion grows.",
-    MotionVerdict.DRIFTS: "At the end a {position} moves on at a constant velocity or acceleration.",
-    MotionVerdict.DRIVEN: "A force or another equation changes with time until the end.",
+    MotionVerdict.DRIFTS: "A {position} finally moves with constant velocity or acceleration.",
+    MotionVerdict.DRIVEN: "A force or another equation depends on time until the end of the run.",
 }
-OVERFLOW = "{stopped} leaves the range of numbers after {stopped_at}."
+OVERFLOW = "{stopped} overflows after {stopped_at}."
 LEAST_ERROR = 5e-7  # of a value: more digits than six are in the document
-BAND_TEXT = "last sample outside ±5 % of the range around the last value, all positions"
-
-
-def limit_cycle_text(limit_cycle: LimitCycle) -> Lines:
-    """Yield a limit cycle: prediction and simulation."""
-    predicted = limit_cycle.predicted
-    settles = "settles" if limit_cycle.settles else ""
-    simulated = in_hertz(limit_cycle.lines[0].frequency_hz) if limit_cycle.lines else settles or "–"
-    rows = [
-        ("", "predicted", "played"),
-        ("frequency", in_hertz(predicted.frequency_hz) if predicted else "–", simulated),
-    ]
-    share = f"{predicted.in_contact:.1%}" if predicted else "–"
-    for contact in limit_cycle.contacts:
-        depth = "–" if contact.predicted_depth_m is None else f"{contact.predicted_depth_m * 1e3:.4g} mm"
-        rows += [
-            (f"{contact.name}: depth", depth, settles or f"{contact.depth_m * 1e3:.4g} mm"),
-            (f"{contact.name}: in contact", share, f"{contact.in_contact:.1%}"),
-        ]
-    played_s = f"predicted beside {limit_cycle.simulated_s:g} s played"
-    yield from wrapped(f"{limit_cycle.topology}: the buzz of its contacts, {played_s}")
-    yield ""
-    yield from table(rows, "<>>")
-    yield from notes(limit_cycle.reason, *limit_cycle.notes)
+BAND_TEXT = "(5 % of the range, all positions)"
 
 
 def simulation_text(simulated: SimulationReport) -> Lines:
@@ -111,7 +88,7 @@ def simulation_text(simulated: SimulationReport) -> Lines:
     summary = simulated.summary
     units = {extent.name: extent.unit for extent in summary.extents}
     yield f"{simulated.topology}: {summary.verdict}\n"
-    words = f"Not determined from {summary.end:g} s: {summary.reason}."
+    words = f"Undetermined after {summary.end:g} s: {summary.reason}."
     if summary.verdict is not MotionVerdict.NOT_DETERMINED:
         words = OVERFLOW if summary.stopped else _WORDS[summary.verdict]
         words = words.format(
@@ -122,7 +99,7 @@ def simulation_text(simulated: SimulationReport) -> Lines:
     yield from sentences(words)
     yield ""
     for title, text in _facts(simulated, units):
-        yield from labelled((title, text), width=15)
+        yield from labelled((title, text))
 
 
 def _quantity(value: float, unit: str) -> str:
@@ -144,7 +121,7 @@ def _method(provenance: Provenance) -> str:
 def error_text(estimate: ErrorEstimate) -> str:
     """Return the text of an error estimate: the worst signal, and the compared method."""
     worst = estimate.largest
-    description = "none but rounding; about " if estimate.kind == "rounding" else "about "
+    description = "rounding only, about " if estimate.kind == "rounding" else "about "
     if worst is None or not worst.error:
         return f"{description}0 in every signal ({estimate.compared})"
     size = f"{worst.error:.1g} {worst.unit} in {worst.name} at {worst.at:g} s"
@@ -198,6 +175,7 @@ def _decay_document(fit: Fit) -> Plain:
 
 
 def _oscillation_document(crests: Oscillation, name: str) -> Plain:
+    """Return the sustained oscillation of a signal as plain data."""
     return {
         "signal": name,
         "peak_to_peak": crests.size,
@@ -207,6 +185,7 @@ def _oscillation_document(crests: Oscillation, name: str) -> Plain:
 
 
 def _error_document(error_estimate: ErrorEstimate) -> Plain:
+    """Return the error estimate of a simulation as plain data."""
     signals = [
         record(signal, {"at": ..., "span": ..., "time_s": signal.at, "range": signal.span})
         for signal in error_estimate.signals
@@ -301,13 +280,13 @@ def _panels(signals: Sequence[Signal]) -> dict[str, list[int]]:
 
 def paths_of(signals: Sequence[Signal]) -> list[tuple[int, int]]:
     """Return the signals that are the first two coordinates of one position."""
-    indices = {signal.name: location for location, signal in enumerate(signals) if signal.unit == "m"}
+    index_of = {signal.name: index for index, signal in enumerate(signals) if signal.unit == "m"}
     pairs = [
-        (location, entry(whole_and_index(name)[0], 2))
-        for name, location in indices.items()
+        (index, entry(whole_and_index(name)[0], 2))
+        for name, index in index_of.items()
         if name.endswith("[1]")
     ]
-    return [(location, indices[second]) for location, second in pairs if second in indices]
+    return [(index, index_of[second]) for index, second in pairs if second in index_of]
 
 
 def _draw_paths(ax: Any, trajectory: Trajectory, paths: Sequence[tuple[int, int]]) -> None:
@@ -324,6 +303,7 @@ def _draw_paths(ax: Any, trajectory: Trajectory, paths: Sequence[tuple[int, int]
 
 
 def _panel(ax: Any, trajectory: Trajectory, unit: str, indices: Sequence[int]) -> None:
+    """Draw the signals of one unit, the columns `indices` of a trajectory, as curves over time."""
     title, shown, scale = QUANTITIES.get(unit, ("", unit, 1.0))
     signals, values = trajectory.signals, scale * trajectory.values
     many = _are_many(signals)
@@ -381,19 +361,12 @@ def _style(signals: Sequence[Signal], indices: Sequence[int], index: int) -> tup
 
 
 def _finish(ax: Any, curves: int) -> None:
-    """Label the curves at a panel, with the number of those not shown."""
-    plotted = min(curves, MOST_CURVES)
+    """Label the first curves at a panel, with the number of the others, drawn or not."""
     ax.grid(linewidth=0.4, alpha=0.5)
-    ax.legend(
-        loc="center left",
-        bbox_to_anchor=(1.01, 0.5),
-        fontsize=6.5 if plotted > 10 else 8,
-        ncols=1 if plotted <= 14 else 2,
-        frameon=False,
-        handlelength=2.6,
-        title=f"and {curves - plotted} more" if curves > plotted else None,
-        title_fontsize=7,
-    )
+    style = {"loc": "center left", "bbox_to_anchor": (1.01, 0.5), "fontsize": 8, "frameon": False}
+    handles, labels = ax.get_legend_handles_labels()
+    handles, labels = short_legend(handles, labels, curves)
+    ax.legend(handles, labels, handlelength=2.6, **style)
 
 
 def ensemble_text(ensemble: Ensemble) -> Lines:
@@ -406,7 +379,7 @@ def ensemble_text(ensemble: Ensemble) -> Lines:
     shares = []
     for verdict, count in ensemble.verdicts:
         low, high = share_interval(count, n)
-        text = f"{100 * count / n:.3g} % (95 % sure: {100 * low:.3g} % to {100 * high:.3g} %)"
+        text = f"{100 * count / n:.3g} % (95 % interval: {100 * low:.3g} % to {100 * high:.3g} %)"
         shares.append((verdict, str(count), text))
     yield from table(shares, "<><")
     yield ""
@@ -414,44 +387,37 @@ def ensemble_text(ensemble: Ensemble) -> Lines:
     for name, label in LABELS.items():
         statistics = ensemble.statistics(name)
         if statistics is not None:
-            error = f"± {statistics.standard_error:.1g}" if statistics.count > 1 else ""
-            rows.append(
-                (
-                    label,
-                    f"{statistics.mean:.3g}",
-                    error,
-                    *(f"{v:.3g}" for v in (*statistics.quantiles, statistics.high)),
-                )
-            )
+            scale = MILLIMETRES if name == "copy_error" else 1.0
+            error = f"± {scale * statistics.standard_error:.1g}" if statistics.count > 1 else ""
+            values = (f"{scale * value:.3g}" for value in (*statistics.quantiles, statistics.high))
+            rows.append((label, f"{scale * statistics.mean:.3g}", error, *values))
     yield from table(rows, "<>>>>>>")
     settled = ensemble.statistics("settled")
     if settled is not None and settled.count < n:
-        yield f"  settling time: of the {settled.count} runs that reach it"
+        yield f"  The settling time is that of the {counted(settled.count, 'run')} that settle."
     if ensemble.mean_square is not None:
         yield from notes(_side_by_side(ensemble, ensemble.mean_square))
     if ensemble.interrupted:
-        yield "  interrupted: there were to be more runs"
+        yield "  Interrupted: more runs were requested."
 
 
 def _side_by_side(ensemble: Ensemble, mean_square: MeanSquare) -> str:
     """Return one sentence on the agreement of the runs with the mean-square verdict."""
     n, calm = len(ensemble.runs), ensemble.calm
     if mean_square.why:
-        return f"in mean square: not judged: {mean_square.why}"
-    text = f"{mean_square.verdict}, and {calm} of {counted(n, 'run')} decay or are at rest: "
+        return f"The mean-square verdict is not available: {mean_square.why}."
+    text = f"Verdict: {mean_square.verdict}; {calm} of {counted(n, 'run')} decay or are at rest."
     if mean_square.linearized:
-        return (
-            f"{text}that verdict is of small motions about the start, the runs are of contacts as they come"
-        )
+        return f"{text} The verdict holds for small motions about the start; the runs include open contacts."
     if mean_square.stable is None:
-        return f"{text}bounds leave that verdict open"
+        return f"{text} The error bounds contain 1, so the verdict is undecided."
     if ensemble.agrees:
-        return f"{text}they agree"
+        return f"{text} The runs agree with the verdict."
     if not mean_square.stable:
-        return f"{text}what makes mean squares grow is rarer, or slower, than these runs show"
+        return f"{text} The growth of second moments is rarer or slower than these runs can show."
     if mean_square.settles_in is not None and mean_square.settles_in > ensemble.duration:
-        return f"{text}that takes some {mean_square.settles_in:.2g} s, and the runs show how it begins"
-    return f"{text}what moves the others is a force that goes on, which that verdict is not about"
+        return f"{text} Settling takes about {mean_square.settles_in:.2g} s, longer than the runs."
+    return f"{text} A force that does not end drives the others; the verdict does not include it."
 
 
 def ensemble_document(ensemble: Ensemble) -> Plain:
@@ -512,9 +478,9 @@ def _facts(simulated: SimulationReport, units: Mapping[str, str]) -> Iterator[tu
         description = (
             f" (at most {_quantity(summary.settled_error, 's')} less)" if summary.settled_error else ""
         )
-        yield "settling time", f"{_quantity(summary.settled, 's')}{description}: {BAND_TEXT}"
+        yield "settling time", f"{_quantity(summary.settled, 's')}{description} {BAND_TEXT}"
     elif summary.verdict in (MotionVerdict.DECAYS, MotionVerdict.OSCILLATES):
-        yield "settling time", f"not reached in {summary.end:g} s: {BAND_TEXT}"
+        yield "settling time", f"not reached in {summary.end:g} s {BAND_TEXT}"
     if summary.fit is not None and summary.verdict in (
         MotionVerdict.DECAYS,
         MotionVerdict.OSCILLATES,
@@ -528,19 +494,20 @@ def _facts(simulated: SimulationReport, units: Mapping[str, str]) -> Iterator[tu
     for broken in summary.broken[:MOST_LIMITS]:
         most, beyond = (_quantity(value, broken.unit) for value in (broken.most, broken.most - broken.value))
         when = f"{broken.signal} from {_quantity(broken.first_s, 's')} on: at most {most} at"
-        yield "beyond limit", f"{when} {_quantity(broken.at_s, 's')}, beyond {broken.limit} by {beyond}"
+        yield "limit exceeded", f"{when} {_quantity(broken.at_s, 's')}, above {broken.limit} by {beyond}"
     if len(summary.broken) > MOST_LIMITS:
-        yield "beyond limit", f"and {len(summary.broken) - MOST_LIMITS} more"
+        yield "limit exceeded", f"{len(summary.broken) - MOST_LIMITS} more"
     if summary.overshoot:
-        yield "overshoot", f"{100 * summary.overshoot[1]:.3g} %, {summary.overshoot[0]}"
+        name, relative = summary.overshoot
+        yield "overshoot", f"{100 * relative:.3g} % of the net displacement, {name}"
     for name, distance in summary.copies:
         if distance or moves:
             unit = next(unit for signal, unit in units.items() if signal.endswith(f".{name}"))
-            yield "copies", f"{name} differs by {_quantity(distance, unit)} between peers at the end"
+            yield "coordination error", f"{_quantity(distance, unit)} between the copies of {name} at the end"
     if any(value for _, value in summary.work):
         done = ", ".join(f"{part} {_quantity(value, 'J')}" for part, value in summary.work)
-        yield "work put in", f"{done} by held forces"
-    yield "recorded", f"{summary.rows} rows of {summary.signals} signals until {summary.end:g} s"
+        yield "energy generated", f"{done} (by sample-and-hold)"
+    yield "recorded", f"{summary.rows} samples of {summary.signals} signals until {summary.end:g} s"
     if simulated.provenance.method != EXACT:
         yield "method", _method(simulated.provenance)
     if simulated.error:

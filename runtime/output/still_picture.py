@@ -1,10 +1,11 @@
 """A picture of the initial state: the bodies of every peer, and the surfaces between them.
 
 Takes: a `Model`.
-Gives: `draw_actors`; `Actor`, `keep_in_sight` and `widen`, for an animation.
+Gives: `draw_actors`; `Actor`, `ContactLine`, `keep_in_sight` and `widen`, for an animation.
 Guarantees: bodies on an axis have one row per peer; those in a plane have one plane per peer, all to one
-scale, with a bar along the axis of each rotating body. In space the first two coordinates are drawn. Bodies
-on an axis are not drawn together with bodies in a plane.
+scale. A rotating body has a bar along its axis, or a box that reaches to its grasp points; a line joins two
+bodies between which a force acts. In space the first two coordinates are drawn. Bodies on an axis are not
+drawn together with bodies in a plane.
 Does not: simulate, or determine the bodies (see `object_shapes`).
 """
 
@@ -19,7 +20,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import Model
-from apc.optional import need
 from apc.output.object_shapes import (
     Disc,
     DrawnBody,
@@ -29,7 +29,8 @@ from apc.output.object_shapes import (
     positions_of,
     views_of,
 )
-from apc.output.pictures import colours_of, new_figure
+from apc.output.pictures import colours_of, new_figure, short_legend
+from apc.support.optional import need
 
 MM = 1e3
 COLUMNS, PANEL, MARGIN = 4, 3.2, 1.0  # planes in a row; inches: of a plane, of title and labels
@@ -38,6 +39,7 @@ HALF = 0.36  # half of a body's height, of the distance of two rows
 LARGEST = 11  # mark of a body, in points
 BAR = 48  # length of the bar along the axis of a body that turns, in points
 ROOM = 0.12  # of what is drawn, around it
+THICKNESS = 0.08  # least half width of a box, of its reach
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,12 +57,30 @@ class Actor:
     shift: Any
     artists: tuple[Any, ...]
     turning: tuple[str, ...]
+    boxed: bool = False
 
     def move(self, index: Sequence[float], angle: float = 0.0) -> None:
         """Put it at (d,), in mm, turned by an angle in rad; along an axis it stays in its row."""
-        self.shift.clear().translate(index[0], index[1] if len(index) > 1 else self.row)
-        if self.turning:
+        turned = self.shift.clear().rotate(angle) if self.boxed else self.shift.clear()
+        turned.translate(index[0], index[1] if len(index) > 1 else self.row)
+        if self.turning and not self.boxed:
             self.artists[-1].set_marker(_bar(angle))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ContactLine:
+    """The line from a body to the grasp point `arm`, in mm, of another; `line` is its matplotlib artist."""
+
+    holder: Actor
+    held: Actor
+    arm: tuple[float, ...]
+    line: Any
+
+    def draw(self) -> None:
+        """Draw the line between the present places of both bodies."""
+        arm = (*self.arm, 0.0)[:2] if self.held.boxed else (0.0, 0.0)
+        ends = self.holder.shift.transform([(0.0, 0.0)])[0], self.held.shift.transform([arm])[0]
+        self.line.set_data(*zip(*ends, strict=True))
 
 
 def _bar(angle: float) -> tuple[int, int, float]:
@@ -68,8 +88,8 @@ def _bar(angle: float) -> tuple[int, int, float]:
     return 2, 2, math.degrees(angle) - 90
 
 
-def draw_actors(system: Model) -> tuple[Any, list[Actor]]:
-    """Draw how a model begins; return the matplotlib Figure and the bodies in it, which can be moved.
+def draw_actors(system: Model) -> tuple[Any, list[Actor], list[ContactLine]]:
+    """Draw the initial state of a model; return the matplotlib Figure, its bodies and lines, to be moved.
 
     Raises
     ------
@@ -80,26 +100,36 @@ def draw_actors(system: Model) -> tuple[Any, list[Actor]]:
     axes = _planes(views) if plane else _rows(views)
     names = list(dict.fromkeys(body.name for view in views for body in view.bodies))
     colours = dict(zip(names, colours_of(len(names)), strict=True))
-    actors = []
+    actors: list[Actor] = []
+    lines: list[ContactLine] = []
     for row, (ax, view) in enumerate(zip(axes, views, strict=True)):
         for surface in view.surfaces:
             _draw_surface(ax, surface, row, view.bodies)
         bodies = sorted(view.bodies, key=lambda body: -body.radius)
         for index, body in enumerate(bodies):
             size = max(LARGEST - 2 * index, 7)  # what is covered is seen around what covers it
-            actors.append(_actor(ax, view.name, body, row, colours[body.name], size))
+            arms = [contact.arm for contact in view.contacts if contact.held == body.name]
+            actors.append(_actor(ax, view.name, body, arms, row, colours[body.name], size))
+        named = dict(zip((body.name for body in bodies), actors[-len(bodies) :], strict=True))
+        style = {"color": "k", "linewidth": 1.2, "marker": "o", "markersize": 3, "zorder": 2.5}
+        for contact in view.contacts:
+            [line] = ax.plot([], [], **style)
+            arm = tuple(MM * value for value in contact.arm)
+            lines.append(ContactLine(named[contact.holder], named[contact.held], arm, line))
+            lines[-1].draw()
     keep_in_sight(axes)
     figure = axes[0].figure
     handles = {actor.artists[0].get_label(): actor.artists[0] for actor in actors}
-    figure.legend(handles.values(), handles, loc="outside lower center", ncols=4, frameon=False, fontsize=8)
+    style = {"loc": "outside lower center", "ncols": 4, "frameon": False, "fontsize": 8}
+    figure.legend(*short_legend([*handles.values()], [*handles]), **style)
     left = system.peers - len(views)
-    title = f"{system.name}: at the start" + (f" ({left} more peers)" if left else "")
+    title = f"{system.name}: initial state" + (f" ({left} more peers not drawn)" if left else "")
     if any(len(body.position) == 3 for view in views for body in view.bodies):
-        title += "\nof three coordinates the first two"
+        title += "\nprojection onto the first two coordinates"
     if plane and (alone := _on_an_axis(system)):
-        title += f"\nnot drawn, as they move along one axis: {', '.join(alone)}"
+        title += f"\nnot drawn (motion along one axis): {', '.join(alone)}"
     figure.suptitle(title, fontsize=11)
-    return figure, actors
+    return figure, actors, lines
 
 
 def _planes(views: Sequence[PeerView]) -> list[Any]:
@@ -128,8 +158,19 @@ def _rows(views: Sequence[PeerView]) -> list[Any]:
     return [ax] * len(views)
 
 
-def _actor(ax: Any, peer: str, body: DrawnBody, row: int, colour: Any, size: int) -> Actor:
-    """Draw a body around the origin, shifted to its place; `size` is that of its mark, in points."""
+def _actor(
+    ax: Any,
+    peer: str,
+    body: DrawnBody,
+    arms: Sequence[Sequence[float]],
+    row: int,
+    colour: Any,
+    size: int,
+) -> Actor:
+    """Draw a body around the origin, shifted to its place; `size` is that of its mark, in points.
+
+    A rotating body with grasp points `arms` (k, 2), in m, is a box that reaches to them.
+    """
     patches = need("matplotlib.patches", "plot")
     shift = need("matplotlib.transforms", "plot").Affine2D()
     half, flat = MM * body.radius, len(body.position) == 1
@@ -143,11 +184,18 @@ def _actor(ax: Any, peer: str, body: DrawnBody, row: int, colour: Any, size: int
         shape = patches.Rectangle(corner, *sides, **style) if flat else patches.Circle((0, 0), half, **style)
         artists.append(ax.add_patch(shape))
     turning = tuple(f"{peer}.{text}" for text in body.turning if not flat)
-    if turning:
+    reach = MM * np.abs(arms).max(axis=0) if turning and np.any(arms) else np.zeros(2)
+    if reach.any():
+        half = max(half, float(np.hypot(*reach)))
+        sides = np.maximum(reach, THICKNESS * reach.max())
+        box = {"facecolor": colour, "alpha": 0.35, "edgecolor": "k", "transform": shift + ax.transData}
+        artists.append(ax.add_patch(patches.Rectangle(-sides, *(2 * sides), **box)))
+        shift.clear().rotate(body.angle).translate(x, y)
+    elif turning:
         bar = {"markersize": BAR, "markeredgewidth": 3, "transform": shift + ax.transData, "zorder": 1.5}
         artists += ax.plot(0, 0, color=colour, marker=_bar(body.angle), **bar)
     states = tuple(f"{peer}.{state}" for state in body.states[:2])
-    return Actor(ax, states, half, row, shift, tuple(artists), turning)
+    return Actor(ax, states, half, row, shift, tuple(artists), turning, bool(reach.any()))
 
 
 def _draw_surface(ax: Any, surface: Disc | SupportLine, row: int, bodies: Sequence[DrawnBody]) -> None:

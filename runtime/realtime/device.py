@@ -1,12 +1,12 @@
 """An external device that replaces a peer's simulated one: a measured position, an applied force.
 
-Takes: a file with one function, in Python or C; a peer's program. Gives: `Outside`, `device_function`.
+Takes: a file with one function, in Python or C; a peer's program. Gives: `ExternalDevice`, `device_function`.
 Guarantees: the device function is called for its position at the start of a tick, and with the force at its
 end.
 Does not: enforce device limits, or filter measurements. The velocity is the difference quotient of the last
 two positions.
 
-The function is called at each instant at which anything ticks, `time` in seconds of the model:
+The function is called at each instant with a tick; `time` is in seconds of the model:
 
     def device(time, force):                      double apc_device(double time, const double *force);
         if force is None:                         force is NULL: measure, and return the position in m
@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
-from apc.frame.devices import devices_of
+from apc.lifting.devices import devices_of
 from apc.simulation.program import GroupProgram
 
 NAMES = {".py": "device", ".so": "apc_device"}
@@ -38,13 +38,13 @@ DeviceFunction = Callable[[float, float | None], float]
 
 
 def device_function(path: Path) -> DeviceFunction:
-    """Return the function of a file. Raises ApcError E976 if there is none."""
+    """Return the device function of a file. Raises ApcError E976 if the file has none."""
     name = NAMES.get(path.suffix)
-    hint = "--device device.py"
+    fix = "--device device.py"
     if name is None:
         expected, got = f"one of {', '.join(NAMES)}", path.suffix or "none"
         raise ApcError(
-            Diagnostic("E976", SourceLocation(str(path)), "the suffix of --device", expected, got, hint)
+            Diagnostic("E976", SourceLocation(str(path)), "suffix of --device", expected, got, fix)
         )
     try:
         if path.suffix == ".py":
@@ -52,25 +52,25 @@ def device_function(path: Path) -> DeviceFunction:
         function = ctypes.CDLL(str(path.resolve()))[name]
     except Exception as error:  # whatever the user's own code raises
         message = f"has no function {name}(time, force) that can be loaded: {type(error).__name__}: {error}"
-        raise ApcError(Diagnostic("E976", SourceLocation(str(path)), message, hint=hint)) from None
+        raise ApcError(Diagnostic("E976", SourceLocation(str(path)), message, fix=fix)) from None
     function.restype, function.argtypes = ctypes.c_double, [ctypes.c_double, ctypes.POINTER(ctypes.c_double)]
     return lambda time, force: float(
         function(time, None if force is None else ctypes.byref(ctypes.c_double(force)))
     )
 
 
-class Outside:
-    """A peer's device outside."""
+class ExternalDevice:
+    """An external device in place of a peer's simulated device."""
 
-    def __init__(self, system: Model, member: GroupProgram, exchange: DeviceFunction) -> None:
-        """Find the device variables in the peer's equations.
+    def __init__(self, system: Model, member: GroupProgram, function: DeviceFunction) -> None:
+        """Determine the device's states in the peer's equations.
 
         Raises
         ------
         ApcError
             E931 the peer has no device, or several candidates for a hand.
         """
-        self.exchange = exchange
+        self.function = function
         peer_type = system.groups[member.group].peer_type
         self.device = devices_of(system, option="--device")[peer_type]
         self.derivative = system.peer_types[peer_type].derivative
@@ -78,12 +78,12 @@ class Outside:
         self.before: tuple[float, float] | None = None
 
     def measure(self, time: float, carry: NDArray[np.float64]) -> None:
-        """Write the measurements into the states of the device; `carry` (rows, 1) is overwritten."""
+        """Write the measured position and velocity into the states of the device, `carry` (rows, 1)."""
         result = self._request(time, None)
         if not (isinstance(result, int | float | np.floating) and math.isfinite(result)):
-            message = f"gave {result!r:.40} as its position at {time:.6g} s"
+            message = f"returned {result!r:.40} as position at {time:.6g} s"
             raise ApcError(
-                Diagnostic("E976", SourceLocation("--device"), message, hint="return a finite number, in m")
+                Diagnostic("E976", SourceLocation("--device"), message, advice="return a finite number in m")
             )
         position = float(result)
         if self.before is not None and time > self.before[0]:
@@ -92,7 +92,9 @@ class Outside:
         self.before = time, position
 
     def push(self, time: float, x: NDArray[np.float64], held: NDArray[np.float64]) -> None:
-        """Return the force from this instant on: the effect of `held` (holds,) on the device's mass."""
+        """Call the device with the force from this instant on: the effect of `held` (holds,) on the
+        device's mass.
+        """
         rates = [
             np.asarray(self.derivative(x, u, self.parameters, time)).reshape(-1)[self.device.velocity]
             for u in (held, np.zeros_like(held))
@@ -101,8 +103,9 @@ class Outside:
         self._request(time, float(rates[0] - rates[1]) / inverse)
 
     def _request(self, time: float, force: float | None) -> object:
+        """Return the result of the device function. Raises ApcError E976 for an exception in user code."""
         try:
-            return self.exchange(time, force)
+            return self.function(time, force)
         except Exception as error:  # whatever the user's own code raises
             message = f"raised {type(error).__name__} at {time:.6g} s: {error}"
             raise ApcError(Diagnostic("E976", SourceLocation("--device"), message)) from None

@@ -6,18 +6,18 @@ Guarantees: a datagram is rejected and counted if version, model, peer address o
 match this session. Repeated datagrams, of this or an earlier session, are rejected too.
 Does not: wait, or interpret values (see `peer`).
 
-A datagram is a head, a body by its sort, and the first 16 bytes of HMAC-SHA-256 over both (RFC 2104, the
-length of RFC 4868). Numbers are little-endian, times nanoseconds of the sender's clock:
+A datagram is a head, a body that depends on its sort, and the first 16 bytes of HMAC-SHA-256 over both (RFC
+2104, the length of RFC 4868). Numbers are little-endian, times nanoseconds of the sender's clock:
 
     head    "apc", version, sort, the model's first 8 bytes of SHA-256, sender u32, time i64
-    data    link u16, count of the packet u64, how many values u16, the values f64
-    hello   the sender's nonce u64, the receiver's as far as it is known u64 (0: not yet)
-    answer  both nonces as in a hello, the hello's time i64, when that came i64, when the model begins i64,
-            the session u64 (0: neither is known yet)
+    data    link u16, count of the packet u64, number of values u16, the values f64
+    hello   the sender's nonce u64, the receiver's nonce u64 (0: not known yet)
+    answer  both nonces as in a hello, the hello's time i64, its arrival i64, the start of the model i64, the
+            session u64 (0: the start and the session are not known yet)
 
 A peer draws a random nonce at its start. A datagram with this nonce is therefore of the present session.
-Hellos and answers are sealed with the secret, which is empty if there is none, data with a key of two peers
-and both their nonces:
+Hellos and answers are authenticated with the secret, which may be empty, data with a key of two peers and
+their nonces:
 
     HMAC-SHA-256(secret, "session", number and nonce of the lower peer, number and nonce of the higher one)
 
@@ -45,16 +45,16 @@ FAR = 1 << 61  # nanoseconds, 73 years: sums and differences of such times fit i
 
 # Reasons for dropping a datagram, in the order of the checks, with their texts for the user.
 DROPPED = {
-    "stranger": "of a stranger",
-    "malformed": "torn, or of another version",
+    "stranger": "from an unknown sender",
+    "malformed": "malformed, or of another version",
     "other topology": "of another topology, or of one with another --set",
-    "forged": "without the secret's seal, or of another session",
-    "heard before": "heard before",
-    "joining": "before it had joined",
-    "early": "of a time that was still to come",
-    "late": "of a time long past",
-    "unasked": "an answer to nothing that was asked",
-    "not sent": "not taken by this system",
+    "forged": "invalid signature, or from another session",
+    "duplicate": "duplicate",
+    "joining": "before the sender joined",
+    "early": "with a future time stamp",
+    "late": "with an outdated time stamp",
+    "unasked": "reply without a request",
+    "not sent": "rejected by the operating system",
 }
 
 Address = tuple[str, int]
@@ -62,7 +62,7 @@ Address = tuple[str, int]
 
 @dataclass(frozen=True, slots=True)
 class Data:
-    """Packet number `count` of a link, the link by its place in the model."""
+    """Packet number `count` of a link; the link is given by its index in the model."""
 
     sender: int
     time: int
@@ -73,7 +73,7 @@ class Data:
 
 @dataclass(frozen=True, slots=True)
 class Hello:
-    """A peer's request to another, whose nonce it `received`: is it ready, and when does time 0 occur?"""
+    """A peer's request for a reply from another peer; `received` is the other peer's nonce, 0 if unknown."""
 
     sender: int
     time: int
@@ -83,7 +83,9 @@ class Hello:
 
 @dataclass(frozen=True, slots=True)
 class HelloReply:
-    """The reply to the hello of time `requested` that arrived at `came`: time 0 occurs at `begins`.
+    """The reply to a hello sent at time `requested` that arrived at `came`.
+
+    Time 0 of the model is at `begins`.
 
     `session` is the unique number of the session; 0 if not yet known.
     """
@@ -106,7 +108,7 @@ class Post:
     """
 
     def __init__(self, number: int, topology: bytes, secret: bytes, addresses: Mapping[Address, int]) -> None:
-        """Take who is who.
+        """Set the addresses and draw a nonce.
 
         Parameters
         ----------
@@ -124,19 +126,19 @@ class Post:
         self.nonce = 1 + secrets.randbelow((1 << 64) - 1)
         self.nonces: dict[int, int] = {}
         self.keys: dict[int, bytes] = {}
-        self.past: set[int] = set()  # nonces of others before they were started again
+        self.past: set[int] = set()  # nonces of other peers before a restart
         self.unmet: set[int] = set()
         self.dropped: Counter[str] = Counter()
 
     def data(self, time: int, to: int, link: int, count: int, values: tuple[float, ...]) -> bytes | None:
-        """Return the datagram of a packet, None if the other has not been there.
+        """Return the datagram of a packet, None if the receiver is not connected yet.
 
         Parameters
         ----------
         time
             The time of sending, by this peer's clock.
         to
-            The number of the other.
+            The number of the receiver.
         link, count, values
             As in `Data`.
         """
@@ -144,41 +146,41 @@ class Post:
             self.unmet.add(to)
             return None
         body = DATA_BODY.pack(link, count, len(values)) + struct.pack(f"<{len(values)}d", *values)
-        return self._sealed(DATA, time, body, self.keys[to])
+        return self._datagram(DATA, time, body, self.keys[to])
 
     def hello(self, time: int, to: int) -> bytes:
-        """Return the datagram that asks another whether it is there."""
+        """Return the datagram of a hello to another peer."""
         body = HELLO_BODY.pack(self.nonce, self.nonces.get(to, 0))
-        return self._sealed(HELLO, time, body, self.secret)
+        return self._datagram(HELLO, time, body, self.secret)
 
     def answer(self, time: int, to: Hello, came: int, begins: int, session: int) -> bytes:
-        """Return the encoded reply datagram.
+        """Return the datagram of a reply to a hello.
 
         Parameters
         ----------
         time, came, begins, session
             As in `HelloReply`.
         to
-            The hello to which this is the reply.
+            The hello.
         """
         body = ANSWER_BODY.pack(self.nonce, to.nonce, to.time, came, begins, session)
-        return self._sealed(ANSWER, time, body, self.secret)
+        return self._datagram(ANSWER, time, body, self.secret)
 
     def read(self, datagram: bytes, address: Address) -> Data | Hello | HelloReply | None:
-        """Return the decoded contents of a datagram, None if it is dropped."""
-        why = self._refused(datagram, address)
-        message = None if why else self._message(datagram[:-SEAL])
+        """Return the decoded contents of a datagram, None for a dropped datagram."""
+        why = self._drop_reason(datagram, address)
+        message = None if why else self._decoded(datagram[:-SEAL])
         if message is not None and not isinstance(message, Data):
-            why = self._meet(message)
+            why = self._register_nonce(message)
         if why or message is None:
             self.drop(why or "malformed")
             return None
         return message
 
-    def _meet(self, message: Hello | HelloReply) -> str:
-        """Register the sender of a datagram with this peer's nonce; return the rejection reason, or none."""
+    def _register_nonce(self, message: Hello | HelloReply) -> str:
+        """Register the nonce of the sender of a hello or reply; return the reason for dropping it, or ""."""
         if message.nonce in self.past:
-            return "heard before"
+            return "duplicate"
         if message.received != self.nonce:
             return "unasked" if isinstance(message, HelloReply) else ""
         before = self.nonces.get(message.sender)
@@ -186,13 +188,15 @@ class Post:
             if before is not None:
                 self.past.add(before)
             self.nonces[message.sender] = message.nonce
-            (low, number), (high, two) = sorted([(self.local, self.nonce), (message.sender, message.nonce)])
-            text = b"session" + OF_KEY.pack(low, number, high, two)
+            (low, low_nonce), (high, high_nonce) = sorted(
+                [(self.local, self.nonce), (message.sender, message.nonce)]
+            )
+            text = b"session" + OF_KEY.pack(low, low_nonce, high, high_nonce)
             self.keys[message.sender] = hmac.digest(self.secret, text, "sha256")
         return ""
 
-    def _message(self, datagram: bytes) -> Data | Hello | HelloReply | None:
-        """Return the contents of a datagram with a valid header, None if the rest is invalid."""
+    def _decoded(self, datagram: bytes) -> Data | Hello | HelloReply | None:
+        """Return the contents of a datagram with a valid header, None if its body is invalid."""
         _, _, sort, _, sender, time = HEAD.unpack_from(datagram)
         body = datagram[HEAD.size :]
         if sort == DATA and len(body) >= DATA_BODY.size:
@@ -211,32 +215,36 @@ class Post:
         return None
 
     def drop(self, why: str) -> None:
-        """Count a datagram that was let go."""
+        """Count a dropped datagram."""
         self.dropped[why] += 1
 
-    def _refused(self, datagram: bytes, address: Address) -> str:
-        """Return the reason for dropping a datagram by its header, before decoding; empty if valid."""
-        known = self.addresses.get(address)
-        if known is None:
+    def _drop_reason(self, datagram: bytes, address: Address) -> str:
+        """Return the reason for dropping a datagram by its header, before decoding; "" if it is valid."""
+        number = self.addresses.get(address)
+        if number is None:
             return "stranger"
         if len(datagram) < HEAD.size + SEAL:
             return "malformed"
         magic, version, sort, topology, sender, _ = HEAD.unpack_from(datagram)
-        if (magic, version, sender) != (MAGIC, VERSION, known):
+        if (magic, version, sender) != (MAGIC, VERSION, number):
             return "malformed"
         if topology != self.topology:
             return "other topology"
-        key = self.keys.get(known) if sort == DATA else self.secret
-        if key is not None and hmac.compare_digest(_seal(key, datagram[:-SEAL]), datagram[-SEAL:]):
+        key = self.keys.get(number) if sort == DATA else self.secret
+        if key is not None and hmac.compare_digest(
+            _authentication_code(key, datagram[:-SEAL]), datagram[-SEAL:]
+        ):
             return ""
-        if sort == DATA:  # it may have been started again since it was there
-            self.unmet.add(known)
+        if sort == DATA:  # the sender may have been restarted
+            self.unmet.add(number)
         return "forged"
 
-    def _sealed(self, sort: int, time: int, body: bytes, key: bytes) -> bytes:
-        whole = HEAD.pack(MAGIC, VERSION, sort, self.topology, self.local, time) + body
-        return whole + _seal(key, whole)
+    def _datagram(self, sort: int, time: int, body: bytes, key: bytes) -> bytes:
+        """Return a datagram: header, body and authentication code."""
+        message = HEAD.pack(MAGIC, VERSION, sort, self.topology, self.local, time) + body
+        return message + _authentication_code(key, message)
 
 
-def _seal(key: bytes, whole: bytes) -> bytes:
-    return hmac.digest(key, whole, "sha256")[:SEAL]
+def _authentication_code(key: bytes, message: bytes) -> bytes:
+    """Return the first bytes of the keyed hash of a message."""
+    return hmac.digest(key, message, "sha256")[:SEAL]

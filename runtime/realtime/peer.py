@@ -33,11 +33,10 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import Channel, Link, Model
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation, nearest
 from apc.compiler.wording import counted, cut
-from apc.frame.communication_graph import CommunicationGraph, build_exchange
-from apc.frame.parameters import resolve
 from apc.network.channel import PacketSource, channel_law
 from apc.network.packet_schedule import START, DeliveredPackets
-from apc.realtime.device import DeviceFunction, Outside
+from apc.parameter_values.parameters import resolve
+from apc.realtime.device import DeviceFunction, ExternalDevice
 from apc.realtime.packets import DROPPED, Address, Data, Hello, HelloReply, Post
 from apc.realtime.process_priority import now
 from apc.simulation.interpreted_engine import InterpretedEngine
@@ -45,16 +44,17 @@ from apc.simulation.output_blocks import forces_in_time, unsolved
 from apc.simulation.population import instants_within
 from apc.simulation.settings import Settings
 from apc.simulation.simulation import prepare
+from apc.timing.communication_graph import CommunicationGraph, build_exchange
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 
 NANO = 10**9
-# Seconds after which a packet that has not come is given up, and times its nominal delay if that is more.
+# Seconds after which a missing packet counts as lost, or this multiple of its nominal delay if longer.
 GIVEN_UP, TIMES = 1, 4
-KNOCK = NANO // 20  # from one hello to the next
-# Round trips by which another's clock is known, the shortest of them, and what lies between two.
+HELLO_PERIOD = NANO // 20  # from one hello to the next
+# The number of round trips to measure the offset of a clock, by the shortest, and the time between two.
 TRIPS, BETWEEN = 10, NANO // 200
 HEAD_START = NANO // 2  # between the announcement of time 0 and time 0
 LARGEST = 1 << 16  # bytes of a datagram
@@ -65,22 +65,22 @@ AT_ONCE = 32
 
 
 def live_topology(system: Model) -> Model:
-    """Return a model whose links have the real network's behavior: packets are received as they arrive."""
+    """Return a model whose links receive packets as they arrive on the real network."""
     timings = {timing.name: timing.value for timing in system.timings}
-    late = [
+    largest_delays = [
         max(timings[text] for text in (link.delay, *(pair.delay for pair in link.delays)))
         for link in system.links
     ]
-    given_up = [[float(max(Fraction(GIVEN_UP), TIMES * delay))] for delay in late]
+    given_up = [[float(max(Fraction(GIVEN_UP), TIMES * delay))] for delay in largest_delays]
     links = tuple(map(traced, system.links, given_up))
     return replace(system, links=links, within=())
 
 
 def traced(link: Link, delays: Sequence[float] | Floats) -> Link:
-    """Return a link with recorded delays, in seconds; its treatment of losses is unchanged."""
-    typical = link.channel or Channel(None, None, "uniform", "newest", "hold", None)
-    lawless = replace(typical, loss=None, jitter=None, distribution="uniform")
-    return replace(link, channel=replace(lawless, trace=np.asarray(delays)))
+    """Return a link with recorded delays in seconds; its treatment of losses is unchanged."""
+    channel = link.channel or Channel(None, None, "uniform", "newest", "hold", None)
+    plain_channel = replace(channel, loss=None, jitter=None, distribution="uniform")
+    return replace(link, channel=replace(plain_channel, trace=np.asarray(delays)))
 
 
 class StoppedError(RuntimeError):
@@ -149,15 +149,15 @@ class PeerLoop:
         )
         self.socket = listening
         self.socket.setblocking(False)
-        self.begins = 0  # when the model begins, by this host's clock; 0 while not known
+        self.begins = 0  # the start of the model by this host's clock; 0 while unknown
         self.session = 0  # the number of the common session of all peers; 0 while unknown
-        # Of each other the shortest round trip, and how far its clock was ahead then.
+        # For each other peer the shortest round trip, and the lead of its clock.
         self.offsets: dict[int, tuple[int, int]] = {}
-        self.began: HelloReply | None = None  # the first that said when the model begins
-        self.knocked = 0  # when others were asked last
-        self.first = 0  # the frame with which it joins
+        self.began: HelloReply | None = None  # the first reply with the start of the model
+        self.last_hello = 0  # the time of the last hello
+        self.first = 0  # the frame in which this peer joins
         self.stopped = False
-        self.trouble: ApcError | None = None  # why it ended before its end, where nobody stopped it
+        self.trouble: ApcError | None = None  # the error that ended the loop
         self.stop = stop
         self.watched: list[socket.socket | Connection] = [listening, *([stop] if stop else [])]
         self.rows: list[Floats] = []
@@ -165,40 +165,45 @@ class PeerLoop:
         self._check_addresses()
 
     def _check_addresses(self) -> None:
+        """Raise ApcError E971 for missing, superfluous or equal addresses."""
         pairs = {tuple(pair) for route in self.player.routes for pair in route.pairs.tolist()}
         needed = {item for pair in pairs if self.local in pair for item in pair} - {self.local}
         unknown = [self.exchange.peer_name(other) for other in sorted(needed - set(self.others))][:4]
         wrong = (
             (
                 not needed,
-                f"{self.name} sends nothing over a link and hears nothing: there is nobody to play with",
+                f"{self.name} neither sends nor receives over a link",
                 "apc simulate",
+                "",
             ),
             (
                 self.local in self.others,
-                f"{self.name} is the peer that is played: --to says where the others are",
-                f"--listen HOST:PORT for {self.name}",
+                f"{self.name} is the local peer; --to gives the addresses of the others",
+                "",
+                f"use --listen HOST:PORT for {self.name}",
             ),
             (
                 len(set(self.others.values())) < len(self.others),
-                "two peers have one address: a packet is known by where it comes from",
-                "a port of its own for each",
+                "two peers have the same address; packets are identified by their source address",
+                "",
+                "use a separate port for each",
             ),
             (
                 bool(unknown),
-                f"{self.name} sends to or hears {', '.join(unknown)}, which have no address",
+                f"no address given for {', '.join(unknown)}, connected to {self.name}",
                 " ".join(f'--to "{text}=HOST:PORT"' for text in unknown),
+                "",
             ),
         )
-        for is_wrong, message, hint in wrong:
+        for is_wrong, message, fix, advice in wrong:
             if is_wrong:
                 location = SourceLocation("--to" if needed else self.system.name)
-                raise ApcError(Diagnostic("E971", location, message, hint=hint))
+                raise ApcError(Diagnostic("E971", location, message, fix=fix, advice=advice))
 
-    # ---- meeting
+    # ---- connection
 
     def meet(self, patience: float) -> None:
-        """Determine the start time of the session.
+        """Connect to the other peers and determine the start time of the session.
 
         Raises
         ------
@@ -210,11 +215,11 @@ class PeerLoop:
         end, leads = now() + int(patience * NANO), self.local < min(self.others)
         self.player.warm_up()
         while not self.session:
-            self._knock(self.others)
-            self.take_in(now() + KNOCK)
+            self._send_hellos(self.others)
+            self.take_in(now() + HELLO_PERIOD)
             if self.began is not None:
                 for _ in range(TRIPS):
-                    self._knock(self.others)
+                    self._send_hellos(self.others)
                     self.take_in(now() + BETWEEN)
                 self.begins = self.began.begins - self.offsets[self.began.sender][1]
                 self.session = self.began.session
@@ -222,26 +227,25 @@ class PeerLoop:
                 self.begins, self.session = now() + HEAD_START, self.post.nonce
             elif now() > end:
                 raise self._no_answer(patience)
-        if now() > self.begins:  # who begins late, or again, comes in with the frame after the next
+        if now() > self.begins:  # a late or restarted peer joins in the frame after the next
             self.first = (now() - self.begins) // self.frame_ns + 2
             self.player.instant = self.first * self.frame_ns
 
-    def _knock(self, others: Iterable[int]) -> None:
-        """Ask others whether they are there."""
-        self.knocked = now()
+    def _send_hellos(self, others: Iterable[int]) -> None:
+        """Send a hello to other peers."""
+        self.last_hello = now()
         for other in others:
             self._send(self.post.hello(now(), other), self.others[other])
 
     def _no_answer(self, patience: float) -> ApcError:
+        """Return error E972 for peers that did not reply in time."""
         missing = sorted(set(self.others) - set(self.post.nonces)) or sorted(self.others)[:1]
         names = ", ".join(self.exchange.peer_name(number) for number in missing)
         dropped = self.post.dropped.items()
         text = "; ".join(f"{counted(count, 'datagram')} dropped: {DROPPED[why]}" for why, count in dropped)
-        message = f"{names} did not say within {patience:g} s when the topology begins" + (
-            text and f" ({text})"
-        )
-        hint = "the same FILE, --set and --secret-file at every peer, started within --wait of each other"
-        return ApcError(Diagnostic("E972", SourceLocation(self.name), message, hint=hint))
+        message = f"no start time received from {names} within {patience:g} s" + (text and f" ({text})")
+        advice = "use the same FILE, --set and --secret-file at every peer, and start all within --wait"
+        return ApcError(Diagnostic("E972", SourceLocation(self.name), message, advice=advice))
 
     # ---- running
 
@@ -250,17 +254,20 @@ class PeerLoop:
         simulation, first = self.simulation, self.first
         while first < self.frames:
             count = min(simulation.length, self.frames - first)
-            given = forces_in_time(simulation, first)
-            played = self.player.advance(first, count, given)
-            self.rows.append(played.rows[: played.frames * len(simulation.sample_times)].copy())
-            first += played.frames
-            if played.frames < count:
+            forces = forces_in_time(simulation, first)
+            result = self.player.advance(first, count, forces)
+            self.rows.append(result.rows[: result.frames * len(simulation.sample_times)].copy())
+            first += result.frames
+            if result.frames < count:
                 if not (self.stopped or self.trouble):
                     self.trouble = unsolved(simulation, first)
                 return
 
     def wait(self, instant: int) -> int:
-        """Receive packets until an instant of the model, in nanoseconds; return the lateness."""
+        """Receive packets until an instant of the model, in nanoseconds.
+
+        Return the lateness in nanoseconds.
+        """
         if not self.begins:  # warming up
             return 0
         self.take_in(self.begins + instant)
@@ -276,8 +283,8 @@ class PeerLoop:
                 _, _, datagram, address = heapq.heappop(held)
                 self._send(datagram, address)
             self._read()
-            if self.post.unmet and now() >= self.knocked + KNOCK:
-                self._knock(self.post.unmet)
+            if self.post.unmet and now() >= self.last_hello + HELLO_PERIOD:
+                self._send_hellos(self.post.unmet)
                 self.post.unmet.clear()
             left = min(until, held[0][0] if held else until) - now()
             ready, _, _ = select.select(self.watched, [], [], max(left, 0) / NANO)
@@ -288,6 +295,7 @@ class PeerLoop:
                 return
 
     def _read(self) -> None:
+        """Read the datagrams that have arrived, at most `AT_ONCE`."""
         for _ in range(AT_ONCE):
             try:
                 datagram, address = self.socket.recvfrom(LARGEST)
@@ -306,7 +314,9 @@ class PeerLoop:
                     self._synchronize(answer, came)
 
     def _synchronize(self, answer: HelloReply, came: int) -> None:
-        """Learn another's clock, and when the model begins, by a round trip (RFC 5905, section 8)."""
+        """Determine another peer's clock offset, and the start of the model, from a reply (RFC 5905,
+        section 8).
+        """
         trip = (came - answer.requested) - (answer.time - answer.came)
         ahead = ((answer.came - answer.requested) + (answer.time - came)) // 2
         self.offsets[answer.sender] = min(self.offsets.get(answer.sender, (trip, ahead)), (trip, ahead))
@@ -314,9 +324,10 @@ class PeerLoop:
             self.began = answer
 
     def _send(self, datagram: bytes, address: Address) -> None:
+        """Send a datagram; count it as dropped if the system does not send it."""
         try:
             self.socket.sendto(datagram, address)
-        except OSError:  # nobody is there, or no room: one packet more that is lost
+        except OSError:  # no receiver or no buffer: the packet is lost
             self.post.drop("not sent")
 
 
@@ -336,13 +347,13 @@ class _SinglePeer(InterpretedEngine):
         self.quantum_ns = simulation.quantum * NANO
         schedules = [member.program.schedule for member in population.members]
         self.begin_at = [0, *(int(number * self.quantum_ns) for number in instants_within(schedules))]
-        self.links = [_OfLink(loop, index) for index in range(len(loop.system.links))]
+        self.links = [_LinkState(loop, index) for index in range(len(loop.system.links))]
         self.newest = [np.full(len(route.pairs), START, np.int64) for route in self.routes]
         self.mine = [np.flatnonzero(route.pairs[:, 1] == loop.local) for route in self.routes]
         self.observed: list[list[tuple[Integers, Flags]]] = [[] for _ in self.routes]
-        self.network = _Emulated(loop) if emulate else None
+        self.network = _EmulatedNetwork(loop) if emulate else None
         member = population.members[self.member]
-        self.outside = Outside(loop.system, member, device) if device else None
+        self.outside = ExternalDevice(loop.system, member, device) if device else None
         self.ahead: list[
             tuple[int, int, Data]
         ] = []  # packets not yet received by a tick, by sampling instant
@@ -366,48 +377,50 @@ class _SinglePeer(InterpretedEngine):
         rows: Floats,
         pushes: Sequence[Floats | None],
     ) -> None:
-        """Wait for a segment's instant, execute it, and send its packets at its end."""
+        """Wait for the instant of a segment, execute the segment, and send its packets at its end."""
         instant = number * self.loop.frame_ns + self.begin_at[index]
-        late, begun = self.loop.wait(instant), now()
+        late, begin = self.loop.wait(instant), now()
         self.instant = instant
         outside = self.outside if self.loop.begins else None
         if outside and (index == 0 or self.begin_at[index] > self.begin_at[index - 1]):
-            self._of_device(outside.measure, instant / NANO, self.carries[self.member])
+            self._call_device(outside.measure, instant / NANO, self.carries[self.member])
         super()._segment(number, index, observed, rows, pushes)
-        if outside and index:  # before it nothing ticks: a frame begins with what is sent then
-            self._push(outside)
-        self._hand_over(number, index)
-        took = now() - begun
-        if self.log and self.log[-1][0] == instant:  # what a frame begins with, and its first tick
+        if outside and index:  # segment 0 has sends only, no ticks
+            self._apply_force(outside)
+        self._send_packets(number, index)
+        took = now() - begin
+        if self.log and self.log[-1][0] == instant:  # the sends at the start of a frame, and its first tick
             _, late, before = self.log.pop()
             took += before
         self.log.append((instant, late, took))
 
-    def _of_device(self, requested: Callable[..., None], *subject: object) -> None:
+    def _call_device(self, function: Callable[..., None], *arguments: object) -> None:
         """Call the external device; its failure ends the loop, and the record is kept."""
         try:
-            requested(*subject)
+            function(*arguments)
         except ApcError as error:
             self.loop.trouble = error
             raise StoppedError from None
 
-    def _push(self, outside: Outside) -> None:
-        """Pass the force that acts from this instant on to the external device."""
+    def _apply_force(self, outside: ExternalDevice) -> None:
+        """Pass the force from this instant on to the external device."""
         layout = self.population.members[self.member].program.layout
         carry = self.carries[self.member][:, 0]
-        self._of_device(outside.push, self.instant / NANO, carry[: layout.states], carry[layout.held])
+        self._call_device(outside.push, self.instant / NANO, carry[: layout.states], carry[layout.held])
 
-    def _sees(self, index: int, tick: int, observed: tuple[DeliveredPackets, ...]) -> tuple[Integers, Flags]:
-        """Return the packets that have arrived, and the packets that are due.
+    def _packets_at_tick(
+        self, index: int, tick: int, observed: tuple[DeliveredPackets, ...]
+    ) -> tuple[Integers, Flags]:
+        """Return the packets in effect, and the detected losses, of a route at a tick.
 
         A late peer does not receive packets sampled after its present instant.
         """
         while self.ahead and self.ahead[0][0] <= self.instant:
             _, _, packet = heapq.heappop(self.ahead)
             link = self.links[packet.link]
-            for at, arc in link.arcs[packet.sender]:
-                last = self.newest[at][arc]
-                self.newest[at][arc] = max(last, packet.count) if link.newest else packet.count
+            for route_index, arc in link.arcs[packet.sender]:
+                last = self.newest[route_index][arc]
+                self.newest[route_index][arc] = max(last, packet.count) if link.newest else packet.count
         route, newest, arrival_process = (
             self.routes[index],
             self.newest[index],
@@ -416,12 +429,12 @@ class _SinglePeer(InterpretedEngine):
         instant = int(self.instant // self.quantum_ns)
         due = (instant - arrival_process.nominal - arrival_process.phase) // arrival_process.period
         missing = (newest < due) & (due >= 0) if route.zero else np.zeros(len(newest), np.bool_)
-        mine = self.mine[index]
-        self.observed[index].append((newest[mine].copy(), missing[mine].copy()))
+        own_arcs = self.mine[index]
+        self.observed[index].append((newest[own_arcs].copy(), missing[own_arcs].copy()))
         return newest.copy(), missing
 
-    def _hand_over(self, number: int, index: int) -> None:
-        """Send the packets of a segment, each at its instant or, emulated, at its arrival time."""
+    def _send_packets(self, number: int, index: int) -> None:
+        """Send the packets of a segment, each at its instant or, if emulated, at its arrival time."""
         loop, member = self.loop, self.population.members[self.member]
         sent = member.program.schedule.sent
         slots = {(sent[row].link, sent[row].slot) for row in member.program.segments[index].sent}
@@ -438,17 +451,17 @@ class _SinglePeer(InterpretedEngine):
                 delay = self.network.delay(link, other, count) if self.network else 0
                 self.sent[link.location][other] += 1
                 if delay is not None:
-                    at = loop.begins + instant + delay
-                    datagram = loop.post.data(at, other, link.location, count, values)
+                    due = loop.begins + instant + delay
+                    datagram = loop.post.data(due, other, link.location, count, values)
                     if datagram is None:
                         loop.post.drop("not sent")
                         continue
-                    heapq.heappush(self.held_back, (at, len(self.log), datagram, loop.others[other]))
+                    heapq.heappush(self.held_back, (due, len(self.log), datagram, loop.others[other]))
 
     def receive(self, packet: Data, came: int) -> None:
-        """Store a packet that arrived at an instant of the session, unless its contents are impossible."""
+        """Store a packet that arrived at an instant of the session, unless its contents are invalid."""
         link = self.links[packet.link] if packet.link < len(self.links) else None
-        if why := "malformed" if link is None else self._refused(packet, came, link):
+        if why := "malformed" if link is None else self._drop_reason(packet, came, link):
             self.loop.post.drop(why)
             return
         assert link is not None
@@ -461,29 +474,30 @@ class _SinglePeer(InterpretedEngine):
         heapq.heappush(self.ahead, (link.instant(packet.count), len(self.arrivals), packet))
         self.arrivals.append((link.location, packet.sender, packet.count, link.instant(packet.count), came))
 
-    def _refused(self, packet: Data, came: int, link: _OfLink) -> str:
-        """Return the reason for dropping a packet, empty if valid."""
+    def _drop_reason(self, packet: Data, came: int, link: _LinkState) -> str:
+        """Return the reason for dropping a packet, "" if it is valid."""
         if packet.sender not in link.arcs or len(packet.values) != len(link.channels_of(packet.sender)):
             return "malformed"
         if not self.loop.begins:
             return "joining"
         frame, frame_now = packet.count // link.slots, came // self.loop.frame_ns
-        # Of the frames that are kept the oldest may be overwritten by one that is early.
+        # An early packet may overwrite the oldest stored frame.
         stored = self.population.exchange_program.ring - 3
         if frame < frame_now - stored:
             return "late"
         # A late peer may still need packets that a newer one would overwrite.
         if frame > min(frame_now + 1, self.instant // self.loop.frame_ns + stored - 1):
             return "early"
-        return "heard before" if packet.count in link.counts.get(packet.sender, ()) else ""
+        return "duplicate" if packet.count in link.counts.get(packet.sender, ()) else ""
 
 
-class _OfLink:
-    """A peer's view of a link: `index` and `name`; `slots` per frame; its receivers and senders.
+class _LinkState:
+    """The data of a link at one peer.
 
-    `channels` are the channels that each peer sends over the link, in the order of a packet's values, and
-    `keys` their storage keys. `arcs` are the routes and directed links of each sender, `counts` the packets
-    received from it.
+    `location` is the index of the link, `name` its name, `slots` the number of packets per frame; `receivers`
+    are the peers that receive from this peer. `channels` are the channels that each peer sends over the link,
+    in the order of a packet's values, and `keys` their storage keys. `arcs` are the routes and directed links
+    of each sender, `counts` the numbers of the packets received from each sender.
     """
 
     def __init__(self, loop: PeerLoop, index: int) -> None:
@@ -498,16 +512,16 @@ class _OfLink:
         for member in population.members:
             sent = sorted({sent.channel for sent in member.program.schedule.sent if sent.link == self.name})
             self.channels |= dict.fromkeys(member.peers.tolist(), sent)
-        listed = enumerate(population.exchange_program.keys)
-        self.keys = {(sent.channel, sent.slot): row for row, sent in listed if sent.link == self.name}
+        rows = enumerate(population.exchange_program.keys)
+        self.keys = {(sent.channel, sent.slot): row for row, sent in rows if sent.link == self.name}
         self.receivers: set[int] = set()
         self.arcs: dict[int, list[tuple[int, int]]] = {}
-        for at, route in enumerate(population.exchange_program.routes):
+        for route_index, route in enumerate(population.exchange_program.routes):
             for arc, (sender, receiver) in enumerate(route.pairs.tolist() if route.link == self.name else ()):
                 if sender == loop.local:
                     self.receivers.add(receiver)
                 if receiver == loop.local:
-                    self.arcs.setdefault(sender, []).append((at, arc))
+                    self.arcs.setdefault(sender, []).append((route_index, arc))
         self.counts: dict[int, set[int]] = {}
 
     def channels_of(self, peer: int) -> list[str]:
@@ -519,49 +533,54 @@ class _OfLink:
         return int(self.phase + count * self.period)
 
 
-class _Emulated:
-    """Emulation of the links in the topology: the delay of each packet, and its loss."""
+class _EmulatedNetwork:
+    """Emulation of the links in the topology: the delay and the loss of each packet."""
 
     def __init__(self, loop: PeerLoop) -> None:
         self.loop = loop
         self.timings = resolve(loop.system).timings
         self.delays: dict[tuple[int, int], Iterator[tuple[int, float]]] = {}
 
-    def delay(self, link: _OfLink, other: int, count: int) -> int | None:
-        """Return the delay of a packet in nanoseconds, None if lost; the counts of a link only grow."""
+    def delay(self, link: _LinkState, other: int, count: int) -> int | None:
+        """Return the delay of a packet in nanoseconds, None if lost; the counts of a link must increase."""
         key = link.location, other
         if key not in self.delays:
-            self.delays[key] = enumerate(_plotted(self._source(link, other)))
+            self.delays[key] = enumerate(_packet_delays(self._source(link, other)))
         value = next(delay for number, delay in self.delays[key] if number == count)
         return None if math.isinf(value) else int(value * NANO)
 
-    def _source(self, link: _OfLink, other: int) -> PacketSource:
-        """Return the emulated packet delays and losses of a link from this peer to another."""
+    def _source(self, link: _LinkState, receiver: int) -> PacketSource:
+        """Return the random delays and losses of the packets from this peer to a receiver over a link.
+
+        A link without a declared channel has its nominal delay and no losses.
+        """
         loop, exchange = self.loop, self.loop.exchange
-        arc, declared = (loop.local, other), loop.system.links[link.location]
-        of, to = map(exchange.group_of, arc)
-        delay = self.timings[exchange.delay(link.name, of, to)]
+        arc, declared_link = (loop.local, receiver), loop.system.links[link.location]
+        sender_group, receiver_group = map(exchange.group_of, arc)
+        delay = self.timings[exchange.delay(link.name, sender_group, receiver_group)]
         law = channel_law(
-            loop.system, declared if declared.channel else traced(declared, [float(delay)]), delay
+            loop.system,
+            declared_link if declared_link.channel else traced(declared_link, [float(delay)]),
+            delay,
         )
         return PacketSource(law, link.name, [arc], seed=loop.simulation.seed)
 
 
-def _plotted(source: PacketSource) -> Iterator[float]:
+def _packet_delays(source: PacketSource) -> Iterator[float]:
     """Yield the delays of a directed link's packets, in seconds."""
     while True:
         yield from source.take(AHEAD)[0].tolist()
 
 
 def number_of(exchange: CommunicationGraph, name: str, option: str) -> int:
-    """Return the number of a peer called `left[1]`, as given to an option.
+    """Return the number of a peer with a name such as `left[1]`, as given to an option.
 
     Parameters
     ----------
     exchange
         The peers of the model.
     name, option
-        The given texts, and the option.
+        The name of the peer, and the option for messages.
 
     Raises
     ------
@@ -574,7 +593,5 @@ def number_of(exchange: CommunicationGraph, name: str, option: str) -> int:
     names = every[:4]
     expected = f"one of {', '.join(names)}{', …' if len(every) > 4 else ''}"
     near = nearest(name, [f"{group}[1]" for group in exchange.groups]) or names[0]
-    hint = f'{option} "{near}{"=HOST:PORT" if option == "--to" else ""}"'
-    raise ApcError(
-        Diagnostic("E970", SourceLocation(option), "a peer", expected, cut(name) or "nothing", hint)
-    )
+    fix = f'{option} "{near}{"=HOST:PORT" if option == "--to" else ""}"'
+    raise ApcError(Diagnostic("E970", SourceLocation(option), "peer", expected, cut(name) or "nothing", fix))

@@ -31,7 +31,7 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 TOPOLOGY = "topology.apc"
-# Of the arrays of a peer's file the type and the number of dimensions, and of those of each route.
+# The type and the number of dimensions of the arrays in a peer's file, and of the arrays of each route.
 ARRAYS = {
     "time": ("<f8", 1),
     "values": ("<f8", 2),
@@ -47,10 +47,10 @@ class PeerRecord:
     """The metadata of one peer's run.
 
     `session` is the common session number; `first` is the frame in which the peer joined, of `frames`;
-    `outside` is whether it had an external device. `signals` are the recorded signals. `dropped` counts
+    `outside` states whether it had an external device. `signals` are the recorded signals. `dropped` counts
     datagrams by reason; `not_granted` lists the privileges that were not granted; `sent` counts packets by
-    link and receiver; `offsets` are, for each other peer, the shortest round trip and how far its clock was
-    ahead, in seconds.
+    link and receiver; `offsets` are, for each other peer, the shortest round trip and the lead of its clock,
+    in seconds.
     """
 
     name: str
@@ -73,9 +73,9 @@ class PeerRecord:
 class PeerRun(PeerRecord):
     """The record of one peer's run.
 
-    `values` (rows, signals) are its signals at `time` (rows,) in seconds, as `simulate` gives them. `delayed`
-    and `took` (n,) are, for each instant, the start after its due time and the execution time, in seconds.
-    `arrivals` (n, 5) are link, sender, count, sampling instant and arrival instant of a packet, in
+    `values` (rows, signals) are its signals at `time` (rows,) in seconds, as `simulate` returns them.
+    `delayed` and `took` (n,) are, for each instant, the start after its due time and the execution time, in
+    seconds. `arrivals` (n, 5) are link, sender, count, sampling instant and arrival instant of a packet, in
     nanoseconds of the session. `packets` and `missing` are, per route of the model, the packets in effect and
     the losses at its ticks on the peer's incoming links (ticks, links).
     """
@@ -90,13 +90,13 @@ class PeerRun(PeerRecord):
 
     @property
     def arcs(self) -> list[tuple[int, int]]:
-        """The link and the sender of each incoming connection with packets."""
+        """The (link, sender) pairs of incoming directed links with packets."""
         return sorted({(link, sender) for link, sender in self.arrivals[:, :2].tolist()})
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RealtimeRun:
-    """Several peers' part of one run of a model."""
+    """The records of some or all peers of one run of a model."""
 
     folder: str
     system: Model
@@ -108,13 +108,14 @@ def run_of(loop: PeerLoop, digest: bytes, not_given: tuple[str, ...]) -> PeerRun
     simulation, player = loop.simulation, loop.player
     rows = np.concatenate([np.zeros((0, simulation.population.width)), *loop.rows])
     last = int(simulation.settings.duration / simulation.quantum)
-    played = len(rows) // len(simulation.sample_times)
-    instants, recorded = instants_of(simulation, loop.first, played, last)
-    recorded &= np.isfinite(rows).all(axis=1)
-    # After a stop request it does not wait for the last instant.
+    frame_count = len(rows) // len(simulation.sample_times)
+    instants, is_recorded = instants_of(simulation, loop.first, frame_count, last)
+    is_recorded &= np.isfinite(rows).all(axis=1)
+    # After a stop request the loop does not wait for the last instant.
     log = np.maximum(np.array(player.log, np.int64).reshape(-1, 3), 0)
 
-    def observed(index: int, kind: type) -> tuple[NDArray[Any], ...]:
+    def at_ticks(index: int, kind: type) -> tuple[NDArray[Any], ...]:
+        """Return one entry of the records at ticks for each route, (ticks, links)."""
         arcs = zip(player.observed, player.mine, strict=True)
         return tuple(
             np.array([tick[index] for tick in ticks], kind).reshape(len(ticks), len(mine))
@@ -136,40 +137,40 @@ def run_of(loop: PeerLoop, digest: bytes, not_given: tuple[str, ...]) -> PeerRun
         not_granted=not_given,
         sent={link: dict(counts) for link, counts in player.sent.items()},
         offsets={number: (trip / NANO, ahead / NANO) for number, (trip, ahead) in loop.offsets.items()},
-        time=np.asarray(instants[recorded] * float(simulation.quantum), np.float64),
-        values=rows[recorded][:, simulation.order],
+        time=np.asarray(instants[is_recorded] * float(simulation.quantum), np.float64),
+        values=rows[is_recorded][:, simulation.order],
         delayed=log[:, 1] / NANO,
         took=log[:, 2] / NANO,
         arrivals=np.array(player.arrivals, np.int64).reshape(-1, 5),
-        packets=observed(0, np.int64),
-        missing=observed(1, np.bool_),
+        packets=at_ticks(0, np.int64),
+        missing=at_ticks(1, np.bool_),
     )
 
 
 def check_folder(folder: Path, topology: Path) -> None:
-    """Refuse, before the run starts, a folder that can't hold a run of a model.
+    """Raise an error, before the run starts, for a folder that cannot store a run of a model.
 
     Raises
     ------
     ApcError
-        E973 it holds something else, E601 nothing can be written there.
+        E973 the folder contains something else, E601 nothing can be written to it.
     """
     if folder.exists() and not folder.is_dir():
-        message = "is there already, and is no folder"
+        message = "already exists and is not a folder"
     elif folder.exists() and any(folder.iterdir()) and not (folder / TOPOLOGY).is_file():
-        message = "is there already, and is no folder of a run"
+        message = "already exists and is not the folder of a run"
     elif any(
         same_file(folder / TOPOLOGY, path) for path in (topology, topology.parent / f"{topology.stem}.apc")
     ):
-        message = "holds the topology that is played, and is no folder of a run"
+        message = "contains the topology of this run and is not the folder of a run"
     else:
         check_target(folder / TOPOLOGY if folder.exists() else folder)
         return
-    raise ApcError(Diagnostic("E973", SourceLocation(str(folder)), message, hint="--out another.run"))
+    raise ApcError(Diagnostic("E973", SourceLocation(str(folder)), message, fix="--out another.run"))
 
 
 def write_run(folder: Path, system: Model, peers: Sequence[PeerRun], *, whole: bool = False) -> None:
-    """Write the records of the peers.
+    """Write the records of some peers to a folder.
 
     Parameters
     ----------
@@ -178,28 +179,28 @@ def write_run(folder: Path, system: Model, peers: Sequence[PeerRun], *, whole: b
     system
         The model.
     peers
-        Some of its peers, or all.
+        The records of some or all peers.
     whole
-        Whether these are all that stay in the folder.
+        Whether records of other peers in the folder are deleted.
 
     Raises
     ------
     ApcError
-        E601 it can't be written.
+        E601 the folder cannot be written.
     """
-    here = folder if folder.is_dir() else folder.parent
+    parent = folder if folder.is_dir() else folder.parent
     try:
-        with tempfile.TemporaryDirectory(prefix=f".{folder.name[:64]}.", dir=here) as temporary:
-            ready = Path(temporary)
-            store.save(system, ready / TOPOLOGY)
+        with tempfile.TemporaryDirectory(prefix=f".{folder.name[:64]}.", dir=parent) as temporary:
+            temporary_folder = Path(temporary)
+            store.save(system, temporary_folder / TOPOLOGY)
             for peer in peers:
-                _write_peer(ready, peer, system)
+                _write_peer(temporary_folder, peer, system)
             folder.mkdir(exist_ok=True)
-            written = {path.name for path in ready.iterdir()}
+            written = {path.name for path in temporary_folder.iterdir()}
             for name in sorted(
                 written, key=lambda name: name != TOPOLOGY
-            ):  # by which a run's folder is known
-                (ready / name).replace(folder / name)
+            ):  # the file that identifies a run's folder comes first
+                (temporary_folder / name).replace(folder / name)
         for path in (*folder.glob("*.npz"), *folder.glob("*-to-*.csv")) if whole else ():
             if path.name not in written:
                 path.unlink()
@@ -212,7 +213,7 @@ def _write_peer(folder: Path, peer: PeerRun, system: Model) -> None:
     record = msgspec.json.encode({field.name: getattr(peer, field.name) for field in fields(PeerRecord)})
     arrays = {name: getattr(peer, name) for name in ARRAYS}
     for name in OF_ROUTES:
-        arrays |= {f"{name}{at}": array for at, array in enumerate(getattr(peer, name))}
+        arrays |= {f"{name}{index}": array for index, array in enumerate(getattr(peer, name))}
     arrays["record"] = np.frombuffer(record, np.uint8)
     np.savez_compressed(folder / f"{file_name(peer.name)}.npz", **arrays)
     for link, sender in peer.arcs:
@@ -224,9 +225,10 @@ def _write_peer(folder: Path, peer: PeerRun, system: Model) -> None:
 
 
 def delays_of(peer: PeerRun, link: int, sender: int) -> Floats:
-    """Return the delays (n,) of a directed link's packets, from sampling to arrival; infinite if lost.
+    """Return the delays (n,) of a directed link's packets, from sampling to arrival.
 
-    They begin with the first packet that the peer could receive and end with the last that arrived.
+    The delay of a lost packet is infinite. The delays begin with the first packet that the peer could receive
+    and end with the last that arrived.
     """
     rows = peer.arrivals[(peer.arrivals[:, 0] == link) & (peer.arrivals[:, 1] == sender)]
     counts = rows[:, 2]
@@ -236,7 +238,7 @@ def delays_of(peer: PeerRun, link: int, sender: int) -> Floats:
 
 
 def file_name(peer: str) -> str:
-    """Return `left-1` for `left[1]`, which a shell would take for a pattern."""
+    """Return the file name `left-1` for `left[1]`, whose brackets are a pattern for a shell."""
     return peer.replace("[", "-").replace("]", "")
 
 

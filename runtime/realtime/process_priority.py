@@ -12,17 +12,17 @@ import gc
 import os
 import time
 
-PRIORITY = 50  # of SCHED_FIFO's 1 to 99: above what serves interrupts' lower halves, below watchdogs
+PRIORITY = 50  # of SCHED_FIFO's 1 to 99: above the threads of interrupts, below watchdogs
 MCL_CURRENT, MCL_FUTURE = 1, 2  # mlockall(2)
 
 
 def now() -> int:
-    """Return the time in nanoseconds by a clock that is as fast as the host's, and is never set."""
+    """Return the time of the host's monotonic clock, in nanoseconds."""
     return time.monotonic_ns()
 
 
 def claim() -> tuple[str, ...]:
-    """Request real-time scheduling and locked memory; return the privileges not granted."""
+    """Request real-time scheduling and locked memory; return the privileges that were not granted."""
     gc.collect()
     gc.freeze()
     gc.disable()
@@ -30,14 +30,15 @@ def claim() -> tuple[str, ...]:
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
     except (OSError, AttributeError) as error:
-        missing.append(f"SCHED_FIFO: {_why(error)}")
+        missing.append(f"SCHED_FIFO: {_reason(error)}")
     try:
         if ctypes.CDLL(None, use_errno=True).mlockall(MCL_CURRENT | MCL_FUTURE):
             raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
     except (OSError, AttributeError, TypeError) as error:
-        missing.append(f"mlockall: {_why(error)}")
+        missing.append(f"mlockall: {_reason(error)}")
     return tuple(missing)
 
 
-def _why(error: Exception) -> str:
-    return (error.strerror if isinstance(error, OSError) else "") or "not on this system"
+def _reason(error: Exception) -> str:
+    """Return the reason of a failed request."""
+    return (error.strerror if isinstance(error, OSError) else "") or "not available on this system"

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from apc.analysis.analysis import Analysis, analyze
 from apc.compiler.compiled import Link, Model
+from apc.lifting.numeric_model import numeric_model
 from apc.mean_square.mean_square_stability import MeanSquareStability, mean_square_stability
 from apc.network.link_fit import LinkFit, fit_delays
 from apc.network.packet_schedule import START, DeliveredPackets
@@ -55,7 +56,9 @@ class Ticks:
 
 @dataclass(frozen=True, slots=True)
 class ArcRun:
-    """The packets of a directed link: those `sent` (None without the sender's record), and the arrivals."""
+    """The packets of a directed link: the number `sent` (None without the sender's record), and the
+    arrivals.
+    """
 
     link: str
     sender: str
@@ -67,7 +70,9 @@ class ArcRun:
 
 @dataclass(frozen=True, slots=True)
 class MeasuredLink:
-    """Analysis of the model with a link as measured: `delay` to reception, packets of a directed link."""
+    """The analysis of the model with a link as measured: its `delay`, and the packets of one directed
+    link, `arc`.
+    """
 
     link: str
     arc: str
@@ -98,8 +103,8 @@ class RunComparison(Result):
 
 
 def ticks_of(peer: PeerRun, frame: float) -> Ticks:
-    """Return statistics of a peer's ticks; `frame` is the frame length in seconds."""
-    late, took = (_shares(values) for values in (peer.delayed, peer.took))
+    """Return statistics of a peer's ticks; `frame` is the length of a frame in seconds."""
+    late, took = (_quantiles(values) for values in (peer.delayed, peer.took))
     return Ticks(
         peer=peer.name,
         ticks=len(peer.delayed),
@@ -112,12 +117,13 @@ def ticks_of(peer: PeerRun, frame: float) -> Ticks:
     )
 
 
-def _shares(values: Floats) -> tuple[float, ...]:
+def _quantiles(values: Floats) -> tuple[float, ...]:
+    """Return the quantiles `SHARES` of some values; empty without values."""
     return tuple(float(np.quantile(values, share)) for share in SHARES) if len(values) else ()
 
 
 def compare_run(run: RealtimeRun) -> RunComparison:
-    """Compare a run with the results of `simulate` and `analyze`.
+    """Return the comparison of a run with the results of `simulate` and `analyze`.
 
     Raises
     ------
@@ -127,7 +133,7 @@ def compare_run(run: RealtimeRun) -> RunComparison:
     system, peers = run.system, run.peers
     simulation = prepare(live_topology(system), Settings(_duration(peers), jit=False))
     frame = float(simulation.frame * simulation.quantum)
-    why_not, arcs = _incomplete(system, peers), _arcs(run)
+    why_not, arcs = _reason_not_simulated(system, peers), _arc_runs(run)
     received = [
         [arc for arc in arcs if arc.link == link.name and arc.came.distribution] for link in system.links
     ]
@@ -141,7 +147,7 @@ def compare_run(run: RealtimeRun) -> RunComparison:
         differences={} if why_not else _differences(run, simulation),
         why_not=why_not,
         measured=tuple(
-            _measured(system, link, arc_runs)
+            _measured_link(system, link, arc_runs)
             for link, arc_runs in zip(system.links, received, strict=True)
             if arc_runs
         ),
@@ -149,20 +155,21 @@ def compare_run(run: RealtimeRun) -> RunComparison:
 
 
 def _duration(peers: tuple[PeerRun, ...]) -> Fraction:
+    """Return the duration in seconds that all peers recorded."""
     ends = [float(peer.time[-1]) for peer in peers if len(peer.time)]
     return Fraction(max(min(ends, default=0.0), 1e-3)).limit_denominator(10**6)
 
 
-def _incomplete(system: Model, peers: tuple[PeerRun, ...]) -> str:
-    """Return the reason why the run cannot be simulated, empty if it can."""
+def _reason_not_simulated(system: Model, peers: tuple[PeerRun, ...]) -> str:
+    """Return the reason why the run cannot be simulated, "" if it can."""
     if len(peers) < system.peers:
-        return f"of {system.peers} peers {len(peers)} left their part of the run"
+        return f"only {len(peers)} of {system.peers} peers recorded the run"
     if local := [peer.name for peer in peers if peer.outside]:
-        return f"{', '.join(local)} had a device outside, whose motion is not known"
+        return f"{', '.join(local)} had an external device with unknown motion"
     if none := [peer.name for peer in peers if not all(map(len, peer.packets))]:
-        return f"{', '.join(none)} ended before the first tick that hears"
+        return f"{', '.join(none)} ended before the first tick with received samples"
     late = [peer.name for peer in peers if peer.first]
-    return f"{', '.join(late)} joined later, or again, in a state that others had not" if late else ""
+    return f"{', '.join(late)} joined later or again, in a different state" if late else ""
 
 
 class _DeliveredRun:
@@ -186,31 +193,36 @@ class _DeliveredRun:
     def take(self, until: int) -> tuple[DeliveredPackets, ...]:
         """Return the packets in effect at each route's ticks until the end of a frame, in quanta."""
         first, last, self.now = self.now // self.frame, until // self.frame, until
-        seens = []
-        for route, observed in zip(self.routes, self.observed, strict=True):
-            rows = np.minimum(np.arange(first * route.ticks, last * route.ticks), len(observed.packets) - 1)
-            seens.append(DeliveredPackets(observed.packets[rows], observed.missing[rows]))
-        return tuple(seens)
+        delivered = []
+        for route, recorded in zip(self.routes, self.observed, strict=True):
+            rows = np.minimum(np.arange(first * route.ticks, last * route.ticks), len(recorded.packets) - 1)
+            delivered.append(DeliveredPackets(recorded.packets[rows], recorded.missing[rows]))
+        return tuple(delivered)
 
 
 def _differences(run: RealtimeRun, simulation: Simulation) -> dict[str, tuple[float, float]]:
     """Return the largest differences between recorded and simulated signals, by unit."""
     player = InterpretedEngine(simulation.population, lambda _: _DeliveredRun(run, simulation.population))
-    whole = np.concatenate([block.values for block in blocks(simulation, player=player)])
+    simulated_rows = np.concatenate([block.values for block in blocks(simulation, player=player)])
     simulated = {
-        signal.name: (signal.unit, whole[:, column]) for column, signal in enumerate(simulation.signals)
+        signal.name: (signal.unit, simulated_rows[:, column])
+        for column, signal in enumerate(simulation.signals)
     }
     result: dict[str, tuple[float, float]] = {}
     for peer in run.peers:
-        for name, played in zip(peer.signals, peer.values[: len(whole)].T, strict=True):
+        for name, recorded in zip(peer.signals, peer.values[: len(simulated_rows)].T, strict=True):
             unit, values = simulated[name]
-            far = float(np.abs(played - values[: len(played)]).max(initial=0.0))
-            most, large = result.get(unit, (0.0, 0.0))
-            result[unit] = max(most, far), max(large, float(np.abs(played).max(initial=0.0)))
+            difference = float(np.abs(recorded - values[: len(recorded)]).max(initial=0.0))
+            largest_difference, largest_value = result.get(unit, (0.0, 0.0))
+            result[unit] = (
+                max(largest_difference, difference),
+                max(largest_value, float(np.abs(recorded).max(initial=0.0))),
+            )
     return result
 
 
-def _arcs(run: RealtimeRun) -> tuple[ArcRun, ...]:
+def _arc_runs(run: RealtimeRun) -> tuple[ArcRun, ...]:
+    """Return the packets of each directed link, with statistics of their arrivals."""
     system, peers = run.system, {peer.number: peer for peer in run.peers}
     timings = {timing.name: float(timing.value) for timing in system.timings}
     periods = {clock.name: timings[clock.period] for clock in system.clocks}
@@ -233,7 +245,7 @@ def _arcs(run: RealtimeRun) -> tuple[ArcRun, ...]:
     return tuple(arc_runs)
 
 
-def _measured(system: Model, link: Link, arcs: Sequence[ArcRun]) -> MeasuredLink:
+def _measured_link(system: Model, link: Link, arcs: Sequence[ArcRun]) -> MeasuredLink:
     """Return the analysis with the worst directed link of a network link: most losses, then largest delay."""
     worst = max(arcs, key=lambda arc: (arc.came.lost.value, arc.came.mean))
     came, clocks = worst.came, {clock.name: clock.period for clock in system.clocks}
@@ -244,10 +256,10 @@ def _measured(system: Model, link: Link, arcs: Sequence[ArcRun]) -> MeasuredLink
         replace(timing, value=delay) if timing.name == link.delay else timing for timing in system.timings
     )
     period = next(float(timing.value) for timing in timings if timing.name == clocks[link.clock])
-    worse = replace(traced(link, came.delays), delays=())
-    links = tuple(worse if item is link else item for item in system.links)
-    measured = replace(system, timings=timings, links=links)
-    late = came.longest > LATEST * period or came.packets > LONGEST
-    network = None if late else mean_square_stability(measured)
+    measured_link = replace(traced(link, came.delays), delays=())
+    links = tuple(measured_link if item is link else item for item in system.links)
+    measured_system = replace(system, timings=timings, links=links)
+    too_long = came.longest > LATEST * period or came.packets > LONGEST
+    network = None if too_long else mean_square_stability(numeric_model(measured_system))
     arc = f"{worst.sender} to {worst.receiver}"
-    return MeasuredLink(link.name, arc, float(delay), analyze(measured), network)
+    return MeasuredLink(link.name, arc, float(delay), analyze(numeric_model(measured_system)), network)

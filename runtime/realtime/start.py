@@ -22,23 +22,23 @@ from multiprocessing.connection import Connection
 
 from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
-from apc.frame.communication_graph import build_exchange
-from apc.frame.parameters import resolve
-from apc.processes import Workers, digest_of, local_processes, model_bytes, model_of_bytes
+from apc.parameter_values.parameters import resolve
 from apc.realtime.device import DeviceFunction
 from apc.realtime.packets import Address
 from apc.realtime.peer import PeerLoop, StoppedError
 from apc.realtime.peer_run import PeerRun, run_of
 from apc.realtime.process_priority import claim
+from apc.support.processes import Workers, digest_of, local_processes, model_bytes, model_of_bytes
+from apc.timing.communication_graph import build_exchange
 
 MOST_PEERS = 64  # processes of one machine
 LOOPBACK = "127.0.0.1"
-TO_END = 10.0  # seconds for a peer to end in, and hand over what it did
+TO_END = 10.0  # seconds for a peer to end and return its record
 
 
 @dataclass(frozen=True, slots=True)
 class LocalRun:
-    """Options of a session: `duration` in seconds; `patience` in seconds for connections."""
+    """Options of a session: `duration` in seconds; `patience`, the limit in seconds for connections."""
 
     duration: Fraction
     secret: bytes
@@ -49,46 +49,52 @@ class LocalRun:
 
 @dataclass(frozen=True, slots=True)
 class RunPart:
-    """A peer's part of a run, None if it ended before the model began; its `trouble`, if it ended by that."""
+    """A peer's record, None if it ended before the start of the model.
+
+    `trouble` is the error that ended it.
+    """
 
     run: PeerRun | None
     trouble: ApcError | None = None
 
 
 def address_of(text: str, option: str, peer: str = "") -> Address:
-    """Read HOST:PORT.
+    """Return the address of a text HOST:PORT.
 
     Parameters
     ----------
     text
         The given text.
     option, peer
-        To what, for messages; `--to` is given a peer's name before.
+        The option, and the peer's name in front of the address, for messages.
 
     Raises
     ------
     ApcError
-        E971 if it is none, or no such host is known by an IPv4 address.
+        E971 the text is no address, or the host has no IPv4 address.
     """
     host, colon, port = text.rpartition(":")
     least = 1 if peer else 0  # a port to send to, or to have one chosen
     expected = f"HOST:PORT, the port from {least} to 65535"
-    hint = f'{option} "{peer and f"{peer}="}192.0.2.7:5000"'
+    fix = f'{option} "{peer and f"{peer}="}192.0.2.7:5000"'
     valid = colon and host and port.isascii() and port.isdecimal() and len(port) < 6
     if not (valid and least <= int(port) < 1 << 16):
         raise ApcError(
-            Diagnostic("E971", SourceLocation(option), "an address", expected, text[:80] or "nothing", hint)
+            Diagnostic("E971", SourceLocation(option), "address", expected, text[:80] or "nothing", fix)
         )
     try:
         return socket.getaddrinfo(host, int(port), socket.AF_INET, socket.SOCK_DGRAM)[0][4][:2]  # type: ignore[return-value]
     except (OSError, UnicodeError) as error:
         why = error.strerror if isinstance(error, OSError) else str(error)
-        message = f"the host {host[:80]} is not known by an IPv4 address: {why}"
-        raise ApcError(Diagnostic("E971", SourceLocation(option), message, hint=hint)) from None
+        message = f"the host {host[:80]} has no IPv4 address: {why}"
+        raise ApcError(Diagnostic("E971", SourceLocation(option), message, fix=fix)) from None
 
 
 def listen_at(address: Address) -> socket.socket:
-    """Return a socket that listens at an address. Raises ApcError E974 if it is taken or not this host's."""
+    """Return a socket bound to an address.
+
+    Raises ApcError E974 if the address is occupied or not this host's.
+    """
     listening = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:
         listening.bind(address)
@@ -96,13 +102,13 @@ def listen_at(address: Address) -> socket.socket:
         listening.close()
         message = f"can't listen at {address[0]}:{address[1]}: {error.strerror or error}"
         raise ApcError(
-            Diagnostic("E974", SourceLocation("--listen"), message, hint=f'--listen "{LOOPBACK}:0"')
+            Diagnostic("E974", SourceLocation("--listen"), message, fix=f'--listen "{LOOPBACK}:0"')
         ) from None
     return listening
 
 
 def is_loopback(address: Address) -> bool:
-    """Return whether an address can be reached from this machine only."""
+    """Return whether an address is reachable from this machine only."""
     return ipaddress.ip_address(address[0]).is_loopback
 
 
@@ -115,16 +121,16 @@ def run_single(
     stop: Connection | None = None,
     device: DeviceFunction | None = None,
 ) -> RunPart:
-    """Run one peer.
+    """Return the record of one peer, run in this process.
 
     Parameters
     ----------
     system, peer, listening, addresses, device
         As for `PeerLoop`.
     how
-        For how long, and how.
+        The options of the session.
     stop
-        As for `PeerLoop`; Ctrl-C if not given.
+        As for `PeerLoop`; by default Ctrl-C requests the end.
 
     Raises
     ------
@@ -132,7 +138,7 @@ def run_single(
         Those of `PeerLoop` and `PeerLoop.meet`.
     """
     digest = digest_of(system)
-    with _interrupts() if stop is None else nullcontext(stop) as stopping:
+    with _stop_on_interrupt() if stop is None else nullcontext(stop) as stop_connection:
         loop = PeerLoop(
             *(system, peer, listening, addresses),
             digest=digest,
@@ -140,7 +146,7 @@ def run_single(
             secret=how.secret,
             emulate=how.emulate,
             seed=how.seed,
-            stop=stopping,
+            stop=stop_connection,
             device=device,
         )
         not_given = claim()
@@ -153,11 +159,12 @@ def run_single(
 
 
 @contextmanager
-def _interrupts() -> Iterator[Connection]:
-    """Yield a file that is readable after Ctrl-C; a second Ctrl-C ends the processes."""
+def _stop_on_interrupt() -> Iterator[Connection]:
+    """Yield a connection that becomes readable after Ctrl-C; a second Ctrl-C ends the processes."""
     stop, end = multiprocessing.Pipe(duplex=False)
 
     def pressed(*_: object) -> None:
+        """Close the sending end; raise KeyboardInterrupt if it is closed already."""
         if end.closed:
             raise KeyboardInterrupt
         end.close()
@@ -172,20 +179,22 @@ def _interrupts() -> Iterator[Connection]:
 
 
 def run_all(system: Model, how: LocalRun) -> tuple[RunPart, ...]:
-    """Run all peers of a model on loopback, a process each; Ctrl-C ends all, and the records are returned.
+    """Return the records of all peers, run on loopback in a process each; Ctrl-C ends all peers.
 
-    One that ends without a word, or not at all, is the trouble (E975) of its own part.
+    A process that crashes, or does not end, has the trouble E975 in its own record.
 
     Raises
     ------
     ApcError
-        E975 the peers are too many.
+        E975 too many peers.
     """
     exchange = build_exchange(system, resolve(system).timings)
     if exchange.peers > MOST_PEERS:
-        message = f"{exchange.peers:,} peers would be as many processes: at most {MOST_PEERS}"
+        message = f"{exchange.peers:,} peers need as many processes; the limit is {MOST_PEERS}"
         raise ApcError(
-            Diagnostic("E975", SourceLocation(system.name), message, hint='apc run FILE --peer "user[1]" …')
+            Diagnostic(
+                "E975", SourceLocation(system.name), message, advice="start each peer with --peer NAME"
+            )
         )
     names = [exchange.peer_name(index) for index in range(exchange.peers)]
     sockets = {name: listen_at((LOOPBACK, 0)) for name in names}
@@ -194,10 +203,12 @@ def run_all(system: Model, how: LocalRun) -> tuple[RunPart, ...]:
     model, parts, patience = model_bytes(system), [], None
     running: dict[Future[RunPart], tuple[str, Workers[str, RunPart]]] = {}
     with ExitStack() as stack:
-        for name, listening in sockets.items():  # a pool for each: one that is lost breaks its own
-            shared = _Shared(model, listening, addresses, how, stop)
-            lost = Diagnostic("E975", SourceLocation(name), "ended without a word: what it played is lost")
-            workers = stack.enter_context(local_processes(_run_named, shared, 1, lost))
+        for name, listening in sockets.items():  # a pool for each process, as a crash breaks the pool
+            shared = _ProcessData(model, listening, addresses, how, stop)
+            lost = Diagnostic(
+                "E975", SourceLocation(name), "peer process exited unexpectedly; its recording is lost"
+            )
+            workers = stack.enter_context(local_processes(_run_peer, shared, 1, lost))
             running[workers.submit(name)] = name, workers
         while running:
             try:
@@ -208,10 +219,10 @@ def run_all(system: Model, how: LocalRun) -> tuple[RunPart, ...]:
                 continue
             for future in done:
                 name, workers = running.pop(future)
-                parts.append(_part(future, workers))
+                parts.append(_record_of(future, workers))
             if not done:
                 break
-    silent = f"did not end within {TO_END:g} s of being told to, and was ended: what it played is lost"
+    silent = f"did not exit within {TO_END:g} s and was terminated; its recording is lost"
     for name, _ in running.values():
         parts.append(RunPart(None, ApcError(Diagnostic("E975", SourceLocation(name), silent))))
     for listening in sockets.values():
@@ -219,7 +230,7 @@ def run_all(system: Model, how: LocalRun) -> tuple[RunPart, ...]:
     return tuple(parts)
 
 
-def _part(done: Future[RunPart], workers: Workers[str, RunPart]) -> RunPart:
+def _record_of(done: Future[RunPart], workers: Workers[str, RunPart]) -> RunPart:
     """Return the record of a process that ended normally or with a reported error."""
     error = done.exception()
     if error is None:
@@ -231,8 +242,11 @@ def _part(done: Future[RunPart], workers: Workers[str, RunPart]) -> RunPart:
 
 
 @dataclass(frozen=True, slots=True)
-class _Shared:
-    """The start data of a process: its socket, and all addresses; `stop` is readable at the end."""
+class _ProcessData:
+    """The start data of a process: its socket, and all addresses.
+
+    `stop` becomes readable to request the end.
+    """
 
     model: bytes
     listening: socket.socket
@@ -241,8 +255,8 @@ class _Shared:
     stop: Connection
 
 
-def _run_named(shared: _Shared, name: str) -> RunPart:
-    """Run one peer in a process."""
+def _run_peer(shared: _ProcessData, name: str) -> RunPart:
+    """Return the record of one peer, run in this process."""
     addresses = {other: address for other, address in shared.addresses.items() if other != name}
     system = model_of_bytes(shared.model)
     return run_single(system, name, shared.listening, addresses, shared.how, shared.stop)

@@ -2,7 +2,7 @@
 
 Takes: a `Model` and texts such as `contact.stiffness=10 N/m:3000 N/m`.
 Gives: `parse_axes`; `LOCATION`.
-Guarantees: a parameter that can't be an axis is refused, and said why.
+Guarantees: a parameter that cannot be an axis raises an error with the reason.
 Does not: analyse.
 """
 
@@ -14,9 +14,9 @@ from fractions import Fraction
 from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.wording import with_unit
-from apc.frame.parameter_names import Range, overlap, proposed_range, unit_of
-from apc.parameter_studies.timing_values import refuse_phase
-from apc.sweeps.grid import parse_axis
+from apc.parameter_values.parameter_names import Range, overlap, proposed_range, unit_of
+from apc.studies.grid import parse_axis
+from apc.studies.timing_values import refuse_phase
 
 LOCATION = SourceLocation("region")
 
@@ -29,22 +29,22 @@ _FORM = "contact.stiffness=10 N/m:3000 N/m"
 def parse_axes(
     system: Model, x: str | None, y: str | None, *, scale: Fraction = Fraction(1)
 ) -> tuple[Range, Range]:
-    """Read the two axes of a region: `PATH=LOW:HIGH` each, or the model's own where one is left out.
+    """Return the two axes of a region from texts `PATH=LOW:HIGH`, by default the model's own axes.
 
     Parameters
     ----------
     system
         The model.
     x, y
-        `contact.stiffness=10 N/m:3000 N/m`, or None for that of `studies: region:`.
+        Texts such as `contact.stiffness=10 N/m:3000 N/m`; None is the axis of `studies: region:`.
     scale
         The divisor of the range of y.
 
     Raises
     ------
     ApcError
-        E901 not of that form, or missing; E902 the same parameter twice; E903 a parameter that can't be an
-        axis, or a range too narrow for floats; E622, E881, E204, E624 as `grid.parse_axis`.
+        E901 another form of text, or a missing axis; E902 the same parameter twice; E903 a parameter that
+        cannot be an axis, or a range too narrow for floats; E622, E881, E204, E624 as for `grid.parse_axis`.
     """
     intervals = []
     for letter, text, index in (("x", x, 0), ("y", y, 1)):
@@ -53,16 +53,16 @@ def parse_axes(
             unit = unit_of(system, local.parameter)
             text = f"{local.parameter}={float(local.low)!r} {unit}:{float(local.high)!r} {unit}"
         if text is None:
-            message = f"the topology has no studies: region:, so that --{letter} must be given"
-            given = (y if letter == "x" else x) or ""
-            other = given.partition("=")[0].strip()
-            hint = f'--{letter} "{proposed_range(system, without=other)}"'
-            raise ApcError(Diagnostic("E901", LOCATION, message, hint=hint))
+            message = f"--{letter} is missing, and the topology has no studies: region:"
+            given_axis = (y if letter == "x" else x) or ""
+            other = given_axis.partition("=")[0].strip()
+            fix = f'--{letter} "{proposed_range(system, without=other)}"'
+            raise ApcError(Diagnostic("E901", LOCATION, message, fix=fix))
         name, equals, span = (part.strip() for part in text.partition("="))
         if not (equals and name and span.count(":") == 1):
-            hint = f'--{letter} "{_FORM}"'
+            fix = f'--{letter} "{_FORM}"'
             raise ApcError(
-                Diagnostic("E901", LOCATION, f"--{letter}", "PATH=LOW:HIGH", text[:80] or "nothing", hint)
+                Diagnostic("E901", LOCATION, f"--{letter}", "PATH=LOW:HIGH", text[:80] or "nothing", fix)
             )
         try:
             axis = parse_axis(system, name, span, ends=True)
@@ -75,14 +75,14 @@ def parse_axes(
         least = NARROWEST * max(abs(low), abs(high))
         if high - low < least:
             expected = with_unit(f"a width of at least {float(least):.2g}", axis.unit)
-            message, got = f"the range of {axis.free.label}", with_unit(f"{float(high - low):.2g}", axis.unit)
+            message, got = f"range of {axis.free.label}", with_unit(f"{float(high - low):.2g}", axis.unit)
             raise ApcError(Diagnostic("E903", SourceLocation(f"--{letter}"), message, expected, got))
         intervals.append(Range(axis.free, axis.unit, axis.values[0], axis.values[-1]))
     first, second = intervals
     if overlap(system, first.free, second.free):
         item, other = first.free.label, second.free.label
-        message = f"{item} is on both axes; a region has two parameters"
+        message = f"{item} is on both axes; a region needs two parameters"
         if item != other:
-            message = f"{item} and {other} are not apart: without a group it is that of all groups"
+            message = f"{item} and {other} overlap: a parameter without a group includes all groups"
         raise ApcError(Diagnostic("E902", LOCATION, message))
     return first, replace(second, low=second.low / scale, high=second.high / scale)

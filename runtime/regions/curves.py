@@ -2,8 +2,7 @@
 
 Takes: points (k, 2) along a curve, and tangents there or handles.
 Gives: `handles_of`, `straight_handles`, `between`, `tangents`, `area_under`, `distance_from_arc`.
-Guarantees: `between` is the interpolant that results are given by; a curve scaled is the curve of its points
-and handles scaled.
+Guarantees: `between` is the interpolant of the results; scaling a curve scales its points and handles.
 Does not: use the meaning of the curves.
 
 Between two points a and b lies the cubic with control points a, c, d, b; the handles (k − 1, 2, 2) of a curve
@@ -23,11 +22,12 @@ def handles_of(a: Floats, b: Floats, tangent_a: Floats, tangent_b: Floats) -> Fl
 
     Notes
     -----
-    The slopes are as long as those that meet a circular arc to sixth order: chord/cos²(θ/4), θ the angle
-    between the tangents (de Boor, Höllig and Sabin, High accuracy geometric Hermite interpolation, 1987).
+    The derivatives have the length of those that match a circular arc to sixth order: chord/cos²(θ/4), θ the
+    angle between the tangents (de Boor, Höllig and Sabin, High accuracy geometric Hermite interpolation,
+    1987).
     """
-    turn = np.clip((tangent_a * tangent_b).sum(axis=1), -1, 1)
-    length = 2 * np.linalg.norm(b - a, axis=1) / (1 + np.sqrt((1 + turn) / 2))
+    cosine = np.clip((tangent_a * tangent_b).sum(axis=1), -1, 1)
+    length = 2 * np.linalg.norm(b - a, axis=1) / (1 + np.sqrt((1 + cosine) / 2))
     third = length[:, None] / 3
     return np.stack([a + third * tangent_a, b - third * tangent_b], axis=1)
 
@@ -39,7 +39,7 @@ def straight_handles(points: Floats) -> Floats:
 
 
 def between(points: Floats, handles: Floats, share: float) -> Floats:
-    """Return the points (k − 1, 2) at a share, from 0 to 1, of each segment of a curve."""
+    """Return the points (k − 1, 2) at a relative position, from 0 to 1, of each segment of a curve."""
     s, t = share, 1 - share
     ends = t**3 * points[:-1] + s**3 * points[1:]
     values: Floats = ends + 3 * s * t * (t * handles[:, 0] + s * handles[:, 1])
@@ -54,7 +54,7 @@ def tangents(points: Floats, handles: Floats) -> Floats:
 
 
 def area_under(points: Floats, handles: Floats) -> float:
-    """Return ∫ x dy along a curve: exactly, by three Gauss points a segment."""
+    """Return ∫ x dy along a curve, exactly, by three Gauss points per segment."""
     steps = np.diff(np.stack([points[:-1], handles[:, 0], handles[:, 1], points[1:]]), axis=0)[..., 1]
     total = 0.0
     for node, weight in zip((-np.sqrt(0.6), 0.0, np.sqrt(0.6)), (5 / 18, 8 / 18, 5 / 18), strict=True):
@@ -65,11 +65,11 @@ def area_under(points: Floats, handles: Floats) -> float:
 
 
 def distance_from_arc(tangent_a: Floats, tangent_b: Floats, length: Floats) -> Floats:
-    """Return the largest distance of a cubic of `handles_of` from a circular arc, with contact in the middle.
+    """Return the largest distance of a cubic of `handles_of` from the circular arc with these tangents.
 
-    The chord subtends θ: the distance is (2/27) r sin⁶(θ/4)/cos²(θ/4), r = chord/(2 sin(θ/2)).
+    With θ the angle of the chord it is (2/27) r sin⁶(θ/4)/cos²(θ/4), r = chord/(2 sin(θ/2)).
     """
-    turn = np.clip((tangent_a * tangent_b).sum(axis=1), -1, 1)
-    quarter = np.arccos(turn) / 4
-    error_bound: Floats = length / 54 * np.sin(quarter) ** 5 / np.cos(quarter) ** 3
-    return error_bound
+    cosine = np.clip((tangent_a * tangent_b).sum(axis=1), -1, 1)
+    quarter = np.arccos(cosine) / 4
+    distance: Floats = length / 54 * np.sin(quarter) ** 5 / np.cos(quarter) ** 3
+    return distance

@@ -1,14 +1,14 @@
 """The boundary of a stable region over a delay and another parameter, strip by strip of the delay.
 
-Takes: a `Model`, a delay's range and another parameter's.
+Takes: a `NumericModel`, a delay's range and another parameter's.
 Gives: `TracedRegion`, `trace_delay_strips`.
-Guarantees: within a strip the order of events stays: curves there are as right as those of two parameters
-that reach no time; between strips, where events coincide, the boundary goes straight along the delay's value.
-A number of peers goes by strips too, one each from halfway to the one before to halfway to the next.
-Does not: take two times, or models linearized at their start (None: see `boundary.trace_steps`).
+Guarantees: within a strip the order of events is constant: curves are as accurate as those of two parameters
+that affect no time; between strips, where events coincide, the boundary is straight along the delay's value.
+Each number of peers is a strip, too, with edges halfway to the neighbouring numbers.
+Does not: cover two times, or models linearized at their start (None: see `boundary.trace_steps`).
 
-Where no event moves within a strip, as over a link, whose packets are read at ticks only, nothing changes
-with the delay: the boundary is a straight line at a critical value of the other parameter.
+If no event depends on the delay within a strip, as for a link, whose packets are read at ticks only, the
+boundary is a straight line at a critical value of the other parameter.
 """
 
 from __future__ import annotations
@@ -21,34 +21,34 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.analysis.analysis import lifted_groups
-from apc.compiler.compiled import Model
-from apc.eigen.relative_coordinates import relative_bounded
-from apc.eigen.spectrum import mode_near
-from apc.frame.numeric_model import Prepared
-from apc.frame.parameter_names import ParameterRef, Range, parameter_of
-from apc.parameter_studies.clock_periods import period_segments
-from apc.parameter_studies.count_range import count_segments
-from apc.parameter_studies.crossing import ESTIMATE, search
-from apc.parameter_studies.delay_segments import DelaySegment, delay_progress, delay_segments
-from apc.parameter_studies.evaluator import closed_at, evaluator_of_many, generic, reaches_count
-from apc.parameter_studies.frame_matrices import batch_evaluator
-from apc.parameter_studies.parameter_path import MatrixPath
-from apc.parameter_studies.stability_criteria import NOMINAL, RadiusEvaluator
-from apc.parameter_studies.timing_values import reaches_period, system_with_delay
+from apc.lifting.numeric_model import NumericModel
+from apc.parameter_values.parameter_names import ParameterRef, Range, parameter_of
 from apc.regions.adaptive_grid import HALVINGS
 from apc.regions.axes import LOCATION
-from apc.regions.boundary import BoundaryArc, straight_arc, traced
+from apc.regions.boundary import BoundaryArc, straight_arc, survey_and_trace
 from apc.regions.curves import tangents
 from apc.regions.dominant_pairs import Eigenvalues, log_magnitudes
 from apc.regions.rectangle import DirectFamily, Rectangle, family_over, rectangle_of
+from apc.spectrum.relative_coordinates import relative_bounded
+from apc.spectrum.spectrum import mode_near
+from apc.studies.clock_periods import period_segments
+from apc.studies.count_range import count_segments
+from apc.studies.crossing import ESTIMATE, search
+from apc.studies.delay_segments import DelaySegment, delay_progress, delay_segments
+from apc.studies.evaluator import closed_at, evaluator_of_many, generic
+from apc.studies.evaluator_choice import EvaluatorKind, kind_for_parameter
+from apc.studies.frame_matrices import batch_evaluator
+from apc.studies.parameter_path import MatrixPath
+from apc.studies.stability_criteria import NOMINAL, RadiusEvaluator
+from apc.studies.timing_values import system_with_delay
 
 Floats = NDArray[np.float64]
 
 # Magnitudes evaluated at each point: three complex pairs.
 BRANCHES = 6
 
-# Ends of curves on either side of a strip's edge that are nearer than this many tolerances are one point:
-# each is off by a tolerance at most, and the coordinate it is relative to differs by little.
+# Ends of curves on both sides of a strip's edge are joined if their distance is below this number of
+# tolerances: the error of each is at most one tolerance.
 SAME = 8.0
 
 # The distance inside a strip, relative to its width, of the point that represents its edge.
@@ -57,10 +57,10 @@ INSIDE = 1e-6
 
 @dataclass(frozen=True, slots=True)
 class TracedRegion:
-    """A boundary in the unit square: the delay runs along `axis` (0: x, 1: y).
+    """A boundary in the unit square, from strips of a delay or from one survey.
 
-    `area` is the stable share of the square, `error_bound` bounds its error, `corner` is whether (0, 0) is
-    stable, `cell` are the sides of the largest cells, `finest` is the share of them that the smallest had.
+    `area` is the stable share of the square, `error_bound` bounds its error, `corner` states whether (0, 0)
+    is stable, `cell` are the sides of the largest cells, `finest` is the relative size of the smallest.
     """
 
     arcs: tuple[BoundaryArc, ...]
@@ -73,9 +73,9 @@ class TracedRegion:
 
 @dataclass(frozen=True, slots=True)
 class _Strip:
-    """A strip from `start` to `end` of the delay's unit range, the delay first in its arcs' points.
+    """A strip from `start` to `end` of the delay's unit range; its arcs' first coordinate is the delay.
 
-    `stable` is the stability of the lower ends of its two edges.
+    `stable` is the stability at the lower ends of its two edges.
     """
 
     start: float
@@ -87,25 +87,22 @@ class _Strip:
 
 
 def trace_delay_strips(
-    system: Model,
+    numeric: NumericModel,
     axes: tuple[Range, Range],
     axis: int,
-    prepared: Prepared,
     *,
     cells: int,
     tolerance: float,
     progress: Callable[[str], None] | None = None,
 ) -> TracedRegion | None:
-    """Follow the boundary strip by strip; None if a strip has no closed form.
+    """Return the boundary strip by strip; None if the matrices of a strip have no closed form.
 
     Parameters
     ----------
-    system, axes
-        The model, and its two parameters with their ranges.
+    numeric, axes
+        The model, all subsystems linear, and two of its parameters with their ranges.
     axis
         The index of the delay, 0 or 1; the other axis affects no time.
-    prepared
-        From `numeric_model.prepare`; all subsystems linear.
     cells, tolerance
         As for `stable_region.region`, of every strip.
     progress
@@ -114,37 +111,40 @@ def trace_delay_strips(
     Raises
     ------
     ApcError
-        E844 a time that no delay is linear in.
+        E844 a time that is not linear in the delay.
     """
+    system = numeric.model
     delay, other = axes[axis], axes[1 - axis]
+    is_period = kind_for_parameter(system, delay.free) is EvaluatorKind.PERIODS
     strips: list[_Strip] = []
-    for strip in _delay_strips(system, delay, other, prepared, cells, tolerance, progress):
+    for strip in _delay_strips(numeric, delay, other, cells, tolerance, progress):
         if strip is None:
             return None
         strips.append(strip)
-    if reaches_period(system, delay.free):
-        strips = _between_periods(strips)
-    whole = RadiusEvaluator(system, (delay.free, other.free), prepared, LOCATION, NOMINAL)
+    if is_period:
+        strips = _with_period_errors(strips)
+    pointwise = RadiusEvaluator(numeric, (delay.free, other.free), LOCATION, NOMINAL)
     arcs = [list(strip.arcs) for strip in strips]
     rectangle = rectangle_of(delay, other)
     edges = []
     for index in range(1, len(strips)):
-        listed_edges = _join(strips, arcs, index, SAME * tolerance, whole, rectangle)
-        if reaches_period(system, delay.free):  # the edge is anywhere between two periods
+        edge_arcs = _join_at_edge(strips, arcs, index, SAME * tolerance, pointwise, rectangle)
+        if is_period:  # the edge is anywhere between two periods
             width = max(strips[k].end - strips[k].start for k in (index - 1, index))
-            listed_edges = [replace(edge, errors=edge.errors + width) for edge in listed_edges]
-        edges += listed_edges
+            edge_arcs = [replace(edge, errors=edge.errors + width) for edge in edge_arcs]
+        edges += edge_arcs
 
     def mode_of(arc: BoundaryArc) -> str:
+        """Return the name of the closed system of an arc's critical mode."""
         value = rectangle.values(arc.knots)[0].tolist()
-        closed = closed_at(system, whole.free, prepared, value)
+        closed = closed_at(numeric, pointwise.free, value)
         return mode_near(closed, complex(arc.values[0])).family
 
-    listed = _joined([arc for local in arcs for arc in local] + edges, mode_of)
+    merged = _merged_arcs([arc for arcs_of_strip in arcs for arc in arcs_of_strip] + edges, mode_of)
     widest = max(strip.end - strip.start for strip in strips)
     cell = (widest / cells, 1 / cells)
     return TracedRegion(
-        arcs=tuple(replace(_swapped(arc) if axis else arc, chain=n) for n, arc in enumerate(listed)),
+        arcs=tuple(replace(_swapped(arc) if axis else arc, chain=n) for n, arc in enumerate(merged)),
         area=sum((strip.end - strip.start) * strip.area for strip in strips),
         error_bound=sum((strip.end - strip.start) * strip.error_bound for strip in strips),
         corner=strips[0].stable[0],
@@ -154,43 +154,45 @@ def trace_delay_strips(
 
 
 def _delay_strips(
-    system: Model,
+    numeric: NumericModel,
     delay: Range,
     other: Range,
-    prepared: Prepared,
     cells: int,
     tolerance: float,
     progress: Callable[[str], None] | None,
 ) -> Iterator[_Strip | None]:
-    """Yield the strips in order; None for one that can't be had in closed form."""
-    if reaches_count(system, delay.free) or reaches_period(system, delay.free):
-        pieces = count_segments if reaches_count(system, delay.free) else period_segments
-        for piece in pieces(system, delay, LOCATION):
+    """Yield the strips in order; None for a strip without a closed form."""
+    system = numeric.model
+    kind = kind_for_parameter(system, delay.free)
+    if kind is not EvaluatorKind.DELAYS:
+        segments_of = count_segments if kind is EvaluatorKind.COUNTS else period_segments
+        for segment in segments_of(system, delay, LOCATION):
             ends = [
-                float((number - delay.low) / (delay.high - delay.low)) for number in (piece.low, piece.high)
+                float((number - delay.low) / (delay.high - delay.low))
+                for number in (segment.low, segment.high)
             ]
-            yield _delay_independent_strip(piece, other, ends, prepared)
+            yield _delay_independent_strip(segment, other, ends, numeric)
         return
     # An oversized problem is refused before any strip is analyzed.
     longest = system_with_delay(system, delay.free, delay.high)
-    evaluator_of_many(longest, [other.free], LOCATION, prepared=prepared)
+    evaluator_of_many(numeric.at(longest), [other.free], LOCATION)
     report_progress = delay_progress(
         system, delay.free, delay.low, delay.high, location=LOCATION, progress=progress
     )
-    for piece in delay_segments(system, delay.free, delay.low, prepared, location=LOCATION, high=delay.high):
-        high = min(piece.high, delay.high)
+    for segment in delay_segments(numeric, delay.free, delay.low, location=LOCATION, high=delay.high):
+        high = min(segment.high, delay.high)
         report_progress(high)
-        ends = [float((number - delay.low) / (delay.high - delay.low)) for number in (piece.low, high)]
-        if piece.evaluator is None:
-            yield _delay_independent_strip(piece, other, ends, prepared)
+        ends = [float((number - delay.low) / (delay.high - delay.low)) for number in (segment.low, high)]
+        if segment.evaluator is None:
+            yield _delay_independent_strip(segment, other, ends, numeric)
         else:
-            yield _moving(system, delay, other, piece, ends, prepared, cells, tolerance)
+            yield _varying_strip(numeric, delay, other, segment, ends, cells, tolerance)
 
 
-def _between_periods(strips: Sequence[_Strip]) -> list[_Strip]:
-    """Return strips of which each holds at one period only, with the errors that follow.
+def _with_period_errors(strips: Sequence[_Strip]) -> list[_Strip]:
+    """Return strips that are exact at one period each, with errors for the width of the strips.
 
-    Lines are uncertain by the width of the strip, areas by half of what they differ from the next ones.
+    Lines are uncertain by the width of the strip, areas by half of their difference from neighbouring areas.
     """
     result = []
     for n, strip in enumerate(strips):
@@ -205,25 +207,31 @@ def _between_periods(strips: Sequence[_Strip]) -> list[_Strip]:
 
 
 def _delay_independent_strip(
-    piece: DelaySegment, other: Range, ends: Sequence[float], prepared: Prepared
+    segment: DelaySegment, other: Range, ends: Sequence[float], numeric: NumericModel
 ) -> _Strip | None:
-    """Return a strip in which nothing depends on the delay: straight lines at the other's critical values."""
-    low, high, free = float(other.low), float(other.high), other.free
-    family = evaluator_of_many(piece.inside, [free], LOCATION, prepared=prepared)
-    line = MatrixPath(family, prepared, np.array([parameter_of(piece.inside, free).value]), 0, low, high)
-    result = search(line)
+    """Return a strip that is constant in the delay: straight lines at the other parameter's critical
+    values.
+    """
+    low, high, parameter_ref = float(other.low), float(other.high), other.free
+    inside = numeric.at(segment.inside)
+    family = evaluator_of_many(inside, [parameter_ref], LOCATION)
+    path = MatrixPath(
+        family, inside, np.array([parameter_of(segment.inside, parameter_ref).value]), 0, low, high
+    )
+    result = search(path)
     if not result.stable or any(edge.proof == ESTIMATE for edge in result.edges):
         return None
     arcs, heights = [], [0.0]
     for crossing in result.edges:
         height = min(max((crossing.value - low) / (high - low), 0.0), 1.0)
         heights.append(height)
-        # The stable side is on the left: to the west it is below, to the east above.
-        indices = ends[::-1] if crossing.stable_side == "below" else ends
-        values = line.sample_at(np.array([crossing.value]))[0][0]
+        # The stable side is on the left: below for a line towards smaller delays, above for one towards
+        # larger.
+        line_ends = ends[::-1] if crossing.stable_side == "below" else ends
+        values = path.sample_at(np.array([crossing.value]))[0][0]
         arcs.append(
             straight_arc(
-                np.array([[indices[0], height], [indices[1], height]]),
+                np.array([[line_ends[0], height], [line_ends[1], height]]),
                 np.array([crossing.error / (high - low) + np.spacing(1.0)]),
                 np.array([(ends[0] + ends[1]) / 2, height]),
                 complex(values[np.argmax(np.abs(values))]),
@@ -236,49 +244,49 @@ def _delay_independent_strip(
     return _Strip(ends[0], ends[1], tuple(arcs), (first, first), area, error_bound)
 
 
-def _moving(
-    system: Model,
+def _varying_strip(
+    numeric: NumericModel,
     delay: Range,
     other: Range,
-    piece: DelaySegment,
+    segment: DelaySegment,
     ends: Sequence[float],
-    prepared: Prepared,
     cells: int,
     tolerance: float,
 ) -> _Strip | None:
-    """Return a strip in which events move with the delay: its curves, in units of the whole range."""
-    low = np.array([float(piece.low), float(other.low)])
-    high = np.array([float(min(piece.high, delay.high)), float(other.high)])
+    """Return a strip in which events depend on the delay: its curves, in units of the complete range."""
+    low = np.array([float(segment.low), float(other.low)])
+    high = np.array([float(min(segment.high, delay.high)), float(other.high)])
     rectangle = Rectangle(low, high - low)
-    family = _within(system, (delay.free, other.free), prepared, piece, rectangle)
+    family = _family_of_strip(numeric, (delay.free, other.free), segment, rectangle)
     if family is None:
         return None
-    arcs, survey, area, error_bound = traced(
+    arcs, survey, area, error_bound = survey_and_trace(
         Eigenvalues(family),
         lambda points: log_magnitudes(family.matrices(points), BRANCHES),
         cells=cells,
         tolerance=tolerance,
         offset=rectangle.offset,
     )
-    placed = tuple(_placed(arc, ends) for arc in arcs)
-    return _Strip(ends[0], ends[1], placed, (survey.corners[0], survey.corners[1]), area, error_bound)
+    scaled = tuple(_scaled_arc(arc, ends) for arc in arcs)
+    return _Strip(ends[0], ends[1], scaled, (survey.corners[0], survey.corners[1]), area, error_bound)
 
 
-def _within(
-    system: Model,
-    free: tuple[ParameterRef, ParameterRef],
-    prepared: Prepared,
-    piece: DelaySegment,
+def _family_of_strip(
+    numeric: NumericModel,
+    parameter_refs: tuple[ParameterRef, ParameterRef],
+    segment: DelaySegment,
     rectangle: Rectangle,
 ) -> DirectFamily | None:
-    """Return the matrices over a strip, each step linear in the delay; None where other motions are free."""
-    assert piece.evaluator is not None, "something depends on the delay"
-    groups, exchange = lifted_groups(generic(piece.inside, free[1:]), prepared=prepared)
-    family = batch_evaluator(piece.inside, free, groups, exchange, durations=piece.evaluator.durations)
+    """Return the matrices over a strip, step durations linear in the delay; None if rigid modes change."""
+    assert segment.evaluator is not None, "something depends on the delay"
+    groups, exchange = lifted_groups(numeric.at(generic(segment.inside, parameter_refs[1:])))
+    family = batch_evaluator(
+        segment.inside, parameter_refs, groups, exchange, durations=segment.evaluator.durations
+    )
 
     def errors(values: Floats) -> tuple[Floats, ...]:
-        """Return those of analyses at values, in the coordinates of the evaluator."""
-        closed = [closed_at(system, free, prepared, value) for value in values.tolist()]
+        """Return the error bounds of analyses at values, in the coordinates of the evaluator."""
+        closed = [closed_at(numeric, parameter_refs, value) for value in values.tolist()]
         return tuple(
             np.stack(
                 [
@@ -289,35 +297,35 @@ def _within(
             for k, wiring in enumerate(family.wirings)
         )
 
-    if any(wiring.moving for wiring in family.wirings):
+    if any(wiring.modes_vary for wiring in family.wirings):
         return None
     return family_over(family, rectangle, errors)
 
 
-def _placed(arc: BoundaryArc, ends: Sequence[float]) -> BoundaryArc:
-    """Return an arc of a strip's unit square in that of the whole."""
+def _scaled_arc(arc: BoundaryArc, ends: Sequence[float]) -> BoundaryArc:
+    """Return an arc of a strip's unit square in the unit square of the complete range."""
     scale = np.array([ends[1] - ends[0], 1.0])
 
-    def moved(points: Floats) -> Floats:
-        """Return points of the strip's square; its edges become exactly the strip's ends."""
-        placed: Floats = points * scale + np.array([ends[0], 0.0])
-        placed[points[..., 0] == 0.0, 0], placed[points[..., 0] == 1.0, 0] = ends[0], ends[1]
-        return placed
+    def scaled_points(points: Floats) -> Floats:
+        """Return points in the complete square; the strip's edges are exactly its ends."""
+        scaled: Floats = points * scale + np.array([ends[0], 0.0])
+        scaled[points[..., 0] == 0.0, 0], scaled[points[..., 0] == 1.0, 0] = ends[0], ends[1]
+        return scaled
 
     # A line at distance e from another with the direction t is at distance e det S/|S t| in the scaled
     # square.
-    shrunk = scale[0] / np.linalg.norm(tangents(arc.points, arc.handles) * scale, axis=1)
+    factor = scale[0] / np.linalg.norm(tangents(arc.points, arc.handles) * scale, axis=1)
     return replace(
         arc,
-        points=moved(arc.points),
-        handles=moved(arc.handles),
-        errors=arc.errors * np.maximum(shrunk[:-1], shrunk[1:]),
-        knots=moved(arc.knots),
-        rounding=arc.rounding * float(shrunk.max()),
+        points=scaled_points(arc.points),
+        handles=scaled_points(arc.handles),
+        errors=arc.errors * np.maximum(factor[:-1], factor[1:]),
+        knots=scaled_points(arc.knots),
+        rounding=arc.rounding * float(factor.max()),
     )
 
 
-def _join(
+def _join_at_edge(
     strips: Sequence[_Strip],
     arcs: list[list[BoundaryArc]],
     index: int,
@@ -325,39 +333,41 @@ def _join(
     source: RadiusEvaluator,
     rectangle: Rectangle,
 ) -> list[BoundaryArc]:
-    """Join the curves of two strips at the edge between them; return the straight pieces along it.
+    """Join the curves of two strips at the edge between them; return the straight pieces along the edge.
 
-    Ends that are one point become one; where one side of the edge is stable and the other is not, the
-    boundary follows the edge.
+    Ends within the distance `same` become one point; where one side of the edge is stable and the other is
+    not, the boundary follows the edge.
     """
     edge = strips[index].start
-    marks: list[tuple[float, int, int, int]] = []  # height, side, arc, which end of it
+    arc_ends: list[tuple[float, int, int, int]] = []  # height, side, arc, which end of it
     for side in (0, 1):
         for number, arc in enumerate(arcs[index - 1 + side]):
-            marks += [
+            arc_ends += [
                 (float(arc.points[end, 1]), side, number, end)
                 for end in ((0, -1) if not arc.closed else ())
                 if arc.points[end, 0] == edge
             ]
-    marks.sort()
-    state = [strips[index - 1].stable[1], strips[index].stable[0]]
-    result, below = [], 0.0
-    for height, side, number, end in [*marks, (1.0, -1, 0, 0)]:
-        if state[0] != state[1]:
-            if side >= 0 and below > 0.0 and height - below <= same:
-                local = arcs[index - 1 + side][number]
-                arcs[index - 1 + side][number] = _ended(local, end, np.array([edge, below]))
-                height = below
-            elif height > below:
-                result.append(_edge_piece(edge, below, height, state[0], strips, index, source, rectangle))
+    arc_ends.sort()
+    stable_sides = [strips[index - 1].stable[1], strips[index].stable[0]]
+    result, previous = [], 0.0
+    for height, side, number, end in [*arc_ends, (1.0, -1, 0, 0)]:
+        if stable_sides[0] != stable_sides[1]:
+            if side >= 0 and previous > 0.0 and height - previous <= same:
+                arc_to_join = arcs[index - 1 + side][number]
+                arcs[index - 1 + side][number] = _with_moved_end(arc_to_join, end, np.array([edge, previous]))
+                height = previous
+            elif height > previous:
+                result.append(
+                    _edge_piece(edge, previous, height, stable_sides[0], strips, index, source, rectangle)
+                )
         if side >= 0:
-            state[side] = not state[side]
-        below = height
+            stable_sides[side] = not stable_sides[side]
+        previous = height
     return result
 
 
-def _ended(arc: BoundaryArc, end: int, point: Floats) -> BoundaryArc:
-    """Return an arc with one end moved by less than a tolerance or so."""
+def _with_moved_end(arc: BoundaryArc, end: int, point: Floats) -> BoundaryArc:
+    """Return an arc with one end moved by about a tolerance, with its error increased by the distance."""
     points, errors = arc.points.copy(), arc.errors.copy()
     errors[end] += float(np.linalg.norm(points[end] - point))
     points[end] = point
@@ -374,63 +384,65 @@ def _edge_piece(
     source: RadiusEvaluator,
     rectangle: Rectangle,
 ) -> BoundaryArc:
-    """Return a part of the boundary along an edge between strips, and the unstable mode next to it."""
-    grows = strips[index] if stable_before else strips[index - 1]
-    inside = (1 if stable_before else -1) * INSIDE * (grows.end - grows.start)
-    knot = np.array([edge + inside, (low + high) / 2])
+    """Return a straight part of the boundary along an edge between strips, with the unstable mode
+    next to it.
+    """
+    unstable_strip = strips[index] if stable_before else strips[index - 1]
+    offset = (1 if stable_before else -1) * INSIDE * (unstable_strip.end - unstable_strip.start)
+    knot = np.array([edge + offset, (low + high) / 2])
     points = np.array([[edge, low], [edge, high]])
     dominant = source.dominant(rectangle.values(knot).tolist())
-    # Upwards, the left-hand side is the strip before.
+    # For an upward piece, the left side is the previous strip.
     points = points if stable_before else points[::-1].copy()
     return straight_arc(points, np.array([np.spacing(1.0)]), knot, dominant)
 
 
-def _joined(arcs: Sequence[BoundaryArc], mode_of: Callable[[BoundaryArc], str]) -> list[BoundaryArc]:
-    """Return the arcs, straight ones of one mode that follow one another as one."""
+def _merged_arcs(arcs: Sequence[BoundaryArc], mode_of: Callable[[BoundaryArc], str]) -> list[BoundaryArc]:
+    """Return the arcs, with consecutive straight arcs of one mode merged."""
     result = [arc for arc in arcs if arc.smooth]
-    interchangeable: dict[str, list[BoundaryArc]] = {}
+    straight_arcs: dict[str, list[BoundaryArc]] = {}
     for arc in arcs:
         if not arc.smooth:
-            interchangeable.setdefault(mode_of(arc), []).append(arc)
-    for listed in interchangeable.values():
-        result += _chained(listed)
+            straight_arcs.setdefault(mode_of(arc), []).append(arc)
+    for arcs_of_mode in straight_arcs.values():
+        result += _chains_of(arcs_of_mode)
     return result
 
 
-def _chained(listed: list[BoundaryArc]) -> list[BoundaryArc]:
-    """Return straight arcs, those that follow one another as one."""
+def _chains_of(remaining: list[BoundaryArc]) -> list[BoundaryArc]:
+    """Return straight arcs with consecutive ones merged."""
     arcs = []
-    while listed:
-        arc = listed.pop()
-        for tail, head in ((-1, 0), (0, -1)):  # first what follows it, then what it follows
+    while remaining:
+        arc = remaining.pop()
+        for tail, head in ((-1, 0), (0, -1)):  # first the arcs after it, then the arcs before it
             while not arc.closed:
                 end = arc.points[tail]
                 index = next(
-                    (n for n, arc in enumerate(listed) if np.array_equal(arc.points[head], end)), None
+                    (n for n, arc in enumerate(remaining) if np.array_equal(arc.points[head], end)), None
                 )
                 if index is None:
                     break
-                other = listed.pop(index)
-                arc = _after(arc, other) if tail else _after(other, arc)
+                neighbour = remaining.pop(index)
+                arc = _concatenated(arc, neighbour) if tail else _concatenated(neighbour, arc)
         arcs.append(arc)
     return arcs
 
 
-def _after(arc: BoundaryArc, other: BoundaryArc) -> BoundaryArc:
-    """Return two arcs as one."""
-    points = np.concatenate([arc.points, other.points[1:]])
-    rest: dict[str, Any] = {
-        name: np.concatenate([getattr(arc, name), getattr(other, name)])
+def _concatenated(arc: BoundaryArc, following: BoundaryArc) -> BoundaryArc:
+    """Return the concatenation of two arcs; the second starts at the end of the first."""
+    points = np.concatenate([arc.points, following.points[1:]])
+    fields: dict[str, Any] = {
+        name: np.concatenate([getattr(arc, name), getattr(following, name)])
         for name in ("handles", "errors", "knots", "values")
     }
-    return replace(arc, points=points, **rest)
+    return replace(arc, points=points, **fields)
 
 
 def _swapped(arc: BoundaryArc) -> BoundaryArc:
-    """Return an arc with its coordinates in the other order, and so backwards: the stable side stays left."""
+    """Return an arc with exchanged coordinates, in reverse order: the stable side stays on the left."""
     names = ("points", "handles", "errors", "knots", "values")
-    backwards: dict[str, Any] = {name: getattr(arc, name)[::-1] for name in names}
+    reversed_fields: dict[str, Any] = {name: getattr(arc, name)[::-1] for name in names}
     for name in ("points", "handles", "knots"):
-        backwards[name] = backwards[name][..., ::-1]
-    backwards["handles"] = backwards["handles"][:, ::-1]
-    return replace(arc, **{name: values.copy() for name, values in backwards.items()})
+        reversed_fields[name] = reversed_fields[name][..., ::-1]
+    reversed_fields["handles"] = reversed_fields["handles"][:, ::-1]
+    return replace(arc, **{name: values.copy() for name, values in reversed_fields.items()})

@@ -1,9 +1,9 @@
-"""The eigenvalues that decide, of families of matrices over a plane, with their slopes.
+"""The dominant eigenvalues of families of matrices over a plane, with their slopes.
 
 Takes: a `DirectFamily`: the closed systems of a model as matrices over the unit square, with derivatives.
 Gives: `Pairs`, `join`; `Eigenvalues`; `log_magnitudes`, `by_system`.
-Guarantees: all points at once; what is small is computed in few calls. A complex pair is stood for by its
-eigenvalue of positive imaginary part.
+Guarantees: all points are computed in few calls. A complex pair is represented by its eigenvalue of positive
+imaginary part.
 Does not: use the meaning of the two coordinates.
 
     d log|λ|/dx = Re(dλ/dx / λ)
@@ -17,9 +17,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.eigen.eigenpairs import Eigenpairs, refined
 from apc.regions.adaptive_grid import just_inside
 from apc.regions.rectangle import DirectFamily
+from apc.spectrum.eigenpairs import Eigenpairs, refined
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
@@ -34,10 +34,10 @@ LEAST_MAGNITUDE = 1e-3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pairs:
-    """One eigenvalue a point, the one that decides there.
+    """The critical eigenvalue at each of k points, with its vectors.
 
-    `slope` (k, 2) holds dλ/dx and dλ/dy, `gradient` (k, 2) those of log|λ|; `right` and `left` (k, n_max) are
-    the vectors, filled up with zeros where a system is smaller than the largest.
+    `slope` (k, 2) are dλ/dx and dλ/dy, `gradient` (k, 2) those of log|λ|; `right` and `left` (k, n_max) are
+    the eigenvectors, padded with zeros for smaller systems.
     """
 
     system: Integers
@@ -49,16 +49,16 @@ class Pairs:
 
     @property
     def log_radius(self) -> Floats:
-        """log|λ| (k,): above zero the motion grows."""
+        """log|λ| (k,), positive for a growing mode."""
         return np.log(np.abs(self.value))
 
     def at(self, indices: Integers | NDArray[np.bool_] | slice) -> Pairs:
-        """Return some of the points."""
+        """Return the eigenpairs at some of the points."""
         return Pairs(*(getattr(self, name)[indices] for name in self.__slots__))
 
 
 def join(parts: list[Pairs]) -> Pairs:
-    """Return several lists of pairs as one."""
+    """Return the concatenation of several sets of eigenpairs."""
     return Pairs(*(np.concatenate([getattr(part, name) for part in parts]) for name in Pairs.__slots__))
 
 
@@ -73,42 +73,49 @@ def log_magnitudes(matrices: Sequence[Floats], count: int) -> Floats:
 
 
 def by_system(system: Integers) -> list[tuple[int, Integers]]:
-    """Return each system with its points."""
+    """Return each system's index with the indices of its points."""
     return [(s, np.flatnonzero(system == s)) for s in sorted(set(system.tolist()))]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Eigenvalues:
-    """The eigenvalues of closed systems over the unit square."""
+    """The evaluator of the eigenvalues of closed systems over the unit square."""
 
     family: DirectFamily
 
     def growth(self, points: Floats) -> Floats:
-        """Return the log of the spectral radius (k,) a hair inside the square, as the survey samples it."""
+        """Return the log of the spectral radius (k,) at points just inside the square, as the survey
+        samples it.
+        """
         return log_magnitudes(self.family.matrices(just_inside(points)), 1)[:, 0]
 
     def dominant(self, points: Floats) -> Pairs:
-        """Return the eigenvalue of largest magnitude at each point (k, 2), a hair inside the square."""
+        """Return the eigenvalue of largest magnitude at each point (k, 2), moved just inside the square."""
         points = just_inside(points)
         matrices = self.family.matrices(points)
         values = [np.linalg.eigvals(matrix) for matrix in matrices]
         best = np.stack([np.abs(value).max(axis=1) for value in values], axis=1)
-        # Of systems that share an eigenvalue, one all along: rounding would have them take turns.
+        # Of systems that share an eigenvalue, always the first: rounding would alternate between them.
         system = np.argmax(best >= (1 - SIMILAR) * best.max(axis=1, keepdims=True), axis=1)
         k, widest = len(points), max(self.family.sizes)
         value = np.zeros(k, np.complex128)
         start = np.zeros((k, widest), np.complex128)
-        for s, local in enumerate(values):
+        for s, values_of_system in enumerate(values):
             rows = np.flatnonzero(system == s)
             if len(rows):
-                result = local[rows, np.argmax(np.abs(local[rows]) + 1e-12 * (local[rows].imag > 0), axis=1)]
+                result = values_of_system[
+                    rows,
+                    np.argmax(
+                        np.abs(values_of_system[rows]) + 1e-12 * (values_of_system[rows].imag > 0), axis=1
+                    ),
+                ]
                 value[rows] = result.real + 1j * np.abs(result.imag)
-                # Any start will do that has a share of the vector wanted, and nearly every one has.
+                # An arbitrary start vector: inverse iteration converges unless it is orthogonal.
                 start[rows, : self.family.sizes[s]] = 1 / (1 + np.arange(self.family.sizes[s])) + 0.5j
         guess = Pairs(system, value, np.zeros((k, 2), complex), np.zeros((k, 2)), start, start.copy())
-        return self.follow(points, guess)
+        return self.refine(points, guess)
 
-    def follow(self, points: Floats, guess: Pairs) -> Pairs:
+    def refine(self, points: Floats, guess: Pairs) -> Pairs:
         """Return at each point the eigenvalue of a system nearest to a guess, by inverse iteration.
 
         Parameters
@@ -116,7 +123,7 @@ class Eigenvalues:
         points
             The points (k, 2).
         guess
-            System, eigenvalue and vectors to start from, one a point.
+            The system, eigenvalue and start vectors of each point.
         """
         k = len(points)
         system = guess.system

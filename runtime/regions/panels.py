@@ -17,29 +17,30 @@ import numpy as np
 
 from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
-from apc.frame.communication_graph import build_exchange
-from apc.frame.data_age import linear_subsystems
-from apc.frame.linearize import linearize
-from apc.frame.overrides import Override, apply, parse_override
-from apc.frame.parameter_names import Range, times_of
-from apc.frame.parameters import resolve
-from apc.option_value import with_last_unit
-from apc.parameter_studies.crossing import Progress
+from apc.lifting.data_age import linear_subsystems
+from apc.lifting.numeric_model import numeric_model
+from apc.linearization.linearize import linearize
+from apc.parameter_values.overrides import Override, apply, parse_override
+from apc.parameter_values.parameter_names import Range, times_of
+from apc.parameter_values.parameters import resolve
 from apc.regions.axes import LOCATION, parse_axes
-from apc.regions.overlay import Overlay, overlay_points, parse_overlay
 from apc.regions.stable_region import CELLS, Floats, Region, region
 from apc.result import PlotStyle, Result
+from apc.studies.crossing import Progress
+from apc.support.extension_table import require_extension
+from apc.support.option_value import with_last_unit
+from apc.timing.communication_graph import build_exchange
 
-# By what a parameter is moved to see which weights follow it: no round ratio, so that none of them agree.
+# The relative position of the second parameter value in a test of dependence: an uncommon ratio.
 MOVE = Fraction(19, 13)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Panel:
-    """One picture: the regions of some models with the same settings.
+    """One panel of a figure: the regions of some models with the same settings.
 
-    `gains` are what each region's y is multiplied by in the comparison: 1, or its number of others.
-    `overlays` are published conditions as (label, points (k, 2) in SI).
+    `gains` are the factors on each region's y in the comparison: 1, or the number of other peers. `overlays`
+    are published conditions as (label, points (k, 2) in SI).
     """
 
     title: str
@@ -50,7 +51,7 @@ class Panel:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Panels(Result):
-    """Regions of one figure; `normalized` is whether y is an effective gain, see `gain_factor`."""
+    """The regions of one figure; `normalized` states whether y is an effective gain, see `gain_factor`."""
 
     shown_by = "region_output:panels"
 
@@ -59,7 +60,7 @@ class Panels(Result):
 
     @property
     def alone(self) -> Region | None:
-        """The only region, if it is just one, with nothing laid over it."""
+        """The only region, None if there are several, or overlays, or a normalization."""
         if len(self.panels) > 1 or self.panels[0].overlays or self.normalized:
             return None
         regions = self.panels[0].regions
@@ -71,23 +72,25 @@ class Panels(Result):
 
 
 def parse_panel(text: str) -> tuple[str, ...]:
-    """Read `lan.delay=0 ms, contact.delay=0 ms`: the settings of a panel."""
+    """Return the settings of a panel from a text such as `lan.delay=0 ms, contact.delay=0 ms`."""
     parts = tuple(part.strip() for part in text.split(","))
     if not all(part and "=" in part for part in parts):
         form = '--panel "lan.delay=0 ms, contact.delay=0 ms"'
         raise ApcError(
-            Diagnostic("E907", SourceLocation("--panel"), "a panel", "NAME=VALUE, …", text[:80], form)
+            Diagnostic("E907", SourceLocation("--panel"), "panel", "NAME=VALUE, …", text[:80], form)
         )
     return parts
 
 
 def parse_vary(text: str) -> tuple[tuple[str, ...], ...]:
-    """Read `lan.delay=0,8 ms`: a panel a value; a number without a unit takes that of the last.
+    """Return the settings of panels from a text such as `lan.delay=0,8 ms`, one panel for each value.
+
+    A number without a unit takes the last unit.
 
     Raises
     ------
     ApcError
-        E907 it isn't of that form.
+        E907 another form of text.
     """
     name, equals, values = (part.strip() for part in text.partition("="))
     texts = with_last_unit(values.split(","))
@@ -99,7 +102,7 @@ def parse_vary(text: str) -> tuple[tuple[str, ...], ...]:
     return tuple((f"{name}={value}",) for value in texts)
 
 
-# A model with a panel's settings, its axes, and what its y is multiplied by.
+# A model with a panel's settings, its axes, and the factor on its y.
 _Work = tuple[Model, tuple[Range, Range], int]
 
 
@@ -115,104 +118,119 @@ def compare_regions(
     criterion: str | None = None,
     progress: Progress | None = None,
 ) -> Panels:
-    """Find the regions of some models with some settings.
+    """Return the stable regions of some models with some settings, as panels of one figure.
 
     Parameters
     ----------
     systems
-        The models; the first one's `studies: region:` gives the axes that are left out.
+        The models; the `studies: region:` of the first gives axes that are not named.
     x, y
         The axes, see `axes.parse_axes`.
     panels
         The settings of each panel: `NAME=VALUE` texts.
     overlays
-        Published conditions, see `overlay.parse_overlay`; of the first model.
+        Published conditions for the first model, see `overlay.parse_overlay`.
     normalize
-        Whether y is the effective gain: a model that sums over its others is given y divided by their number,
-        so that its coupling is as strong as that of a model that takes their mean.
+        Whether y is the effective gain: in a model that sums over the other peers, y is divided by their
+        number, so that the coupling is as strong as in a model with their mean.
     cells, criterion, progress
         See `stable_region.region`.
 
     Raises
     ------
     ApcError
-        As `parse_axes`, `parse_override`, `parse_overlay`, `gain_factor` and `region`.
+        As for `parse_axes`, `parse_override`, `parse_overlay`, `gain_factor` and `region`.
     """
+    conditions = require_extension("wall_conditions") if overlays else None
     # All errors are reported before any computation.
-    jobs: list[tuple[str, list[_Work], list[Overlay]]] = []
+    jobs: list[tuple[str, list[_Work], list[Any]]] = []
     for settings in panels:
-        work: list[_Work] = []
+        prepared_models: list[_Work] = []
         for index, original in enumerate(systems):
             system = apply(original, [parse_override(original, text) for text in settings])
             if index and len(systems[0].region) == 2:
                 system = replace(system, region=systems[0].region)
             axes = parse_axes(system, x, y)
-            _refuse_set(axes, system, settings)
+            _refuse_setting_of_axis(axes, system, settings)
             gain = gain_factor(system, axes[1]) if normalize else 1
-            work.append((system, parse_axes(system, x, y, scale=Fraction(gain)), gain))
-        jobs.append((", ".join(settings), work, [parse_overlay(work[0][0], text) for text in overlays]))
+            prepared_models.append((system, parse_axes(system, x, y, scale=Fraction(gain)), gain))
+        jobs.append(
+            (
+                ", ".join(settings),
+                prepared_models,
+                [conditions.parse_overlay(prepared_models[0][0], text) for text in overlays if conditions],
+            )
+        )
     result = []
-    for title, work, laid in jobs:
+    for title, prepared_models, overlays_of_panel in jobs:
         regions = tuple(
-            region(system, axes, cells=cells, criterion=criterion, progress=progress)
-            for system, axes, _ in work
+            region(numeric_model(system), axes, cells=cells, criterion=criterion, progress=progress)
+            for system, axes, _ in prepared_models
         )
-        first, axes, gain = work[0]
-        lines = tuple(
-            (overlay.label, overlay_points(first, overlay, *axes) * [1.0, gain]) for overlay in laid
+        first_model, axes, gain = prepared_models[0]
+        overlay_curves = tuple(
+            (overlay.label, conditions.overlay_points(first_model, overlay, *axes) * [1.0, gain])
+            for overlay in overlays_of_panel
+            if conditions
         )
-        result.append(Panel(title, regions, tuple(gain for _, _, gain in work), lines))
+        result.append(Panel(title, regions, tuple(gain for _, _, gain in prepared_models), overlay_curves))
     return Panels(tuple(result), normalize)
 
 
-def _refuse_set(axes: Sequence[Range], system: Model, settings: Sequence[str]) -> None:
-    """Raise E902 when a panel sets the parameter of an axis."""
+def _refuse_setting_of_axis(axes: Sequence[Range], system: Model, settings: Sequence[str]) -> None:
+    """Raise E902 if a panel sets the parameter of an axis."""
     for text in settings:
-        free = parse_override(system, text).free
+        parameter_ref = parse_override(system, text).free
         for axis in axes:
-            all_of_it = free.group in (None, axis.free.group) and axis.free.name == free.name
-            if all_of_it or axis.free.name in times_of(system, free.name):
-                message = f"{axis.free.label} is on an axis and set for the panel as well"
+            same_parameter = (
+                parameter_ref.group in (None, axis.free.group) and axis.free.name == parameter_ref.name
+            )
+            if same_parameter or axis.free.name in times_of(system, parameter_ref.name):
+                message = f"{axis.free.label} is both on an axis and set for the panel"
                 raise ApcError(Diagnostic("E902", LOCATION, message))
 
 
 def gain_factor(system: Model, axis: Range) -> int:
     """Return the gain factor of a parameter: the number of other peers for a sum, 1 for a mean.
 
-    The mean of N − 1 others is their sum with the gain divided by N − 1.
+    The mean over N − 1 other peers is their sum with the gain divided by N − 1. The received values with this
+    gain are those whose coefficients in the tick equations change with the parameter.
 
     Raises
     ------
     ApcError
-        E906 a parameter of both, an operator that is neither, or peers with unequal numbers of senders.
+        E906 a parameter of a sum and a mean, another operator, or peers with unequal numbers of senders.
     """
-    first = resolve(system)
+    numbers_before = resolve(system)
     value = axis.low + (axis.high - axis.low) * (MOVE - 1)
-    second = resolve(apply(system, [Override(axis.free, value)]))
-    exchange = build_exchange(system, first.timings)
-    numbers: set[int] = set()
-    subsystems = linear_subsystems(system, first.timings)
+    numbers_after = resolve(apply(system, [Override(axis.free, value)]))
+    exchange = build_exchange(system, numbers_before.timings)
+    factors: set[int] = set()
+    subsystems = linear_subsystems(system, numbers_before.timings)
     for index, group in enumerate(system.groups):
-        built = subsystems[group.peer_type]
-        if not built.parameters_suffice:
-            message = (
-                "the topology weighs its others one by one, so that there is no effective gain to compare at"
-            )
+        subsystem = subsystems[group.peer_type]
+        if not subsystem.parameters_suffice:
+            message = "the topology has individual weights, so an effective gain is undefined"
             raise ApcError(Diagnostic("E906", LOCATION, message))
-        before, after = (linearize(built, numbers.parameters[index][0]) for numbers in (first, second))
-        for partition, tick_a, tick_b in zip(built.peer_type.clocks, before.ticks, after.ticks, strict=True):
-            for column in np.flatnonzero((tick_a.r != tick_b.r).any(axis=0)).tolist():
+        peer_before, peer_after = (
+            linearize(subsystem, resolved.parameters[index][0])
+            for resolved in (numbers_before, numbers_after)
+        )
+        for partition, tick_before, tick_after in zip(
+            subsystem.peer_type.clocks, peer_before.ticks, peer_after.ticks, strict=True
+        ):
+            for column in np.flatnonzero((tick_before.r != tick_after.r).any(axis=0)).tolist():
                 receive = partition.receives[column]
                 if receive.operator == "mean":
-                    numbers.add(1)
+                    factors.add(1)
                 elif exchange.is_complete(receive.link):
-                    numbers.add(system.peers - 1)
+                    factors.add(system.peers - 1)
                 else:
                     received = np.bincount(exchange.arcs(receive.link)[0][:, 1], minlength=system.peers)
-                    numbers |= set(received.tolist())
-    if len(numbers) > 1:
+                    factors |= set(received.tolist())
+    if len(factors) > 1:
         message = (
-            f"{axis.free.label} weighs what is heard of {' and '.join(map(str, sorted(numbers)))} others"
+            f"{axis.free.label} is a weight for {' and '.join(map(str, sorted(factors)))} received peers"
         )
-        raise ApcError(Diagnostic("E906", LOCATION, f"{message}, so that there is no one effective gain"))
-    return max(numbers, default=1)
+        raise ApcError(Diagnostic("E906", LOCATION, f"{message}, so the effective gain is not unique"))
+    return max(factors, default=1)

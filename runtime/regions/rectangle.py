@@ -16,10 +16,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.eigen.eigenpairs import driving_parts
-from apc.frame.parameter_names import Range
-from apc.parameter_studies.dominant_eigenvalue import DrivingPart
-from apc.parameter_studies.frame_matrices import MatrixSource
+from apc.parameter_values.parameter_names import Range
+from apc.spectrum.eigenpairs import driving_parts
+from apc.studies.dominant_eigenvalue import DrivingPart
+from apc.studies.frame_matrices import MatrixSource
 
 Floats = NDArray[np.float64]
 
@@ -32,7 +32,7 @@ INSIDE = np.array([[0.1, 0.1], [0.1, 0.9], [0.9, 0.1], [0.9, 0.9]])
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rectangle:
-    """Two ranges in SI: `low` and `width` (2,)."""
+    """The rectangle of two parameter ranges in SI: lower ends `low` and widths `width` (2,)."""
 
     low: Floats
     width: Floats
@@ -59,9 +59,10 @@ def rectangle_of(x: Range, y: Range) -> Rectangle:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DirectFamily:
-    """Matrices over a rectangle: the evaluator is asked for every point.
+    """Matrices over a rectangle, computed by an evaluator at every point.
 
-    `parts` are its systems, `errors` bound those of their matrices (n, n).
+    `parts` are the strongly connected parts of its systems, `errors` bound the errors of the parts' matrices
+    (n, n).
     """
 
     evaluator: MatrixSource
@@ -71,16 +72,16 @@ class DirectFamily:
 
     @property
     def sizes(self) -> tuple[int, ...]:
-        """The number of states of each system."""
+        """The number of states of each part."""
         return tuple(len(part.states) for part in self.parts)
 
     def matrices(self, points: Floats) -> tuple[Floats, ...]:
-        """Return each system's matrices (k, n, n) at points (k, 2)."""
-        whole = self.evaluator.matrices(self.rectangle.values(points))
-        return tuple(_of_part(part, whole[part.system]) for part in self.parts)
+        """Return each part's matrices (k, n, n) at points (k, 2)."""
+        system_matrices = self.evaluator.matrices(self.rectangle.values(points))
+        return tuple(_of_part(part, system_matrices[part.system]) for part in self.parts)
 
     def slopes(self, system: int, points: Floats) -> tuple[Floats, Floats]:
-        """Return one system's matrices (k, n, n) and their derivatives (2, k, n, n) over x and y."""
+        """Return the matrices (k, n, n) of one part, and their derivatives (2, k, n, n) over x and y."""
         count, part = len(points), self.parts[system]
         values = np.concatenate([self.rectangle.values(points)] * 2)
         along = np.zeros_like(values)
@@ -98,22 +99,22 @@ def _of_part(part: DrivingPart, matrices: Floats) -> Floats:
 
 
 def family_over(source: MatrixSource, rectangle: Rectangle, errors: Errors) -> DirectFamily:
-    """Return the matrices over a rectangle, the states that drive each other by themselves.
+    """Return the matrices over a rectangle, divided into strongly connected parts.
 
     Parameters
     ----------
     source
-        Of two free parameters.
+        The matrices over two free parameters.
     rectangle
-        Their ranges.
+        The ranges of the parameters.
     errors
         Bounds (k, n, n) on the errors of each system's matrices at values (k, 2), entry by entry.
     """
     corners = rectangle.values(INSIDE)
-    wrong = tuple(values.max(axis=0) for values in errors(corners))
+    bounds = tuple(values.max(axis=0) for values in errors(corners))
     parts: list[DrivingPart] = []
-    for system, (error, matrix) in enumerate(zip(wrong, source.matrices(corners), strict=True)):
+    for system, (error, matrix) in enumerate(zip(bounds, source.matrices(corners), strict=True)):
         driving = driving_parts(np.abs(matrix).max(axis=0) + error != 0)
         parts += [DrivingPart(system, states) for states in driving or [np.arange(len(error))]]
-    local = tuple(wrong[part.system][np.ix_(part.states, part.states)] for part in parts)
-    return DirectFamily(source, rectangle, tuple(parts), local)
+    part_errors = tuple(bounds[part.system][np.ix_(part.states, part.states)] for part in parts)
+    return DirectFamily(source, rectangle, tuple(parts), part_errors)

@@ -1,70 +1,69 @@
 """The stable region of two parameters: exact boundary curves, areas, and tests of points.
 
-Takes: a `Model`, two parameters and their ranges.
+Takes: a `NumericModel`, two parameters and their ranges.
 Gives: `Curve`, `Region`, `region`, `side_of_curves`.
 Guarantees: every curve comes with a bound on its distance from the boundary, the critical mode and its
 frequency. Empty regions and regions without boundary are supported. The resolution of the search is part of
-the result: a component smaller than a cell can be missed if values around it give no indication.
+the result: a component smaller than a cell can be missed if it has no effect on the values around it.
 Does not: plot, or write files (see `output`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import near_start, prepare_at_start
-from apc.analysis.one_sided_slopes import Side, sides
+from apc.analysis.analysis import near_start
+from apc.analysis.one_sided_slopes import sides
 from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError, Diagnostic
 from apc.compiler.timings import part
 from apc.compiler.wording import counted
-from apc.eigen.interconnection import ClosedLoop
-from apc.eigen.spectrum import mode_near
-from apc.frame.devices import replaced_hands
-from apc.frame.evaluation_errors import finite_equations
-from apc.frame.numeric_model import Prepared, prepare
-from apc.frame.overrides import apply
-from apc.frame.parameter_names import ParameterRef, Range, notes_for_all_groups
+from apc.lifting.devices import replaced_hands
+from apc.lifting.numeric_model import NumericModel, numeric_model
+from apc.linearization.evaluation_errors import finite_equations
 from apc.network.nominal_criterion import limitations, refuse_channel_number
-from apc.parameter_studies.crossing import Progress
-from apc.parameter_studies.dominant_eigenvalue import DrivingPart
-from apc.parameter_studies.evaluator import (
+from apc.parameter_values.overrides import apply
+from apc.parameter_values.parameter_names import ParameterRef, Range, notes_for_all_groups
+from apc.regions.adaptive_grid import blurred, just_inside, survey
+from apc.regions.axes import LOCATION
+from apc.regions.boundary import BoundaryArc, relative_to, stable_area, survey_and_trace, trace_steps
+from apc.regions.curves import between
+from apc.regions.delay_strips import BRANCHES, TracedRegion, trace_delay_strips
+from apc.regions.dominant_pairs import Eigenvalues, log_magnitudes
+from apc.regions.rectangle import INSIDE, DirectFamily, Rectangle, family_over, rectangle_of
+from apc.result import PlotStyle, Result
+from apc.spectrum.interconnection import ClosedLoop
+from apc.spectrum.spectrum import mode_near
+from apc.studies.crossing import Progress
+from apc.studies.dominant_eigenvalue import DrivingPart
+from apc.studies.evaluator import (
     JoinedEvaluator,
     PiecewiseEvaluator,
     closed_at,
     evaluator_of_many,
     overrides_at,
     parameters_suffice,
-    reaches_count,
-    reaches_time,
 )
-from apc.parameter_studies.frame_matrices import BatchEvaluator
-from apc.parameter_studies.stability_criteria import (
+from apc.studies.evaluator_choice import EvaluatorKind, evaluator_for, kind_for_parameter
+from apc.studies.frame_matrices import BatchEvaluator
+from apc.studies.stability_criteria import (
     MEAN_SQUARE,
     NOMINAL,
     PASSIVE,
     SCALAR_CRITERIA,
     RadiusEvaluator,
     criterion_of,
-    refuse_time,
+    refuse_timing_parameter,
     verdict_with,
 )
-from apc.parameter_studies.timing_values import is_scaled, reaches_period
-from apc.regions.adaptive_grid import blurred, just_inside, survey
-from apc.regions.axes import LOCATION
-from apc.regions.boundary import BoundaryArc, relative_to, stable_area, trace_steps, traced
-from apc.regions.curves import between
-from apc.regions.delay_strips import BRANCHES, TracedRegion, trace_delay_strips
-from apc.regions.dominant_pairs import Eigenvalues, log_magnitudes
-from apc.regions.rectangle import INSIDE, DirectFamily, Rectangle, family_over, rectangle_of
-from apc.result import PlotStyle, Result
-from apc.threads import single_threaded
+from apc.studies.timing_values import is_scaled, reaches_period
+from apc.support.threads import single_threaded
 
 if TYPE_CHECKING:
     import pandas
@@ -74,17 +73,17 @@ Floats = NDArray[np.float64]
 # Coarse cells along each side of the rectangle.
 CELLS = 12
 
-# Distance of a smooth curve from the boundary, relative to a coordinate (see `boundary.trace`). Of one that
-# could not be followed so closely it is said, see `Region.coarse`.
+# Distance of a smooth curve from the boundary, relative to a coordinate (see `boundary.trace`). Curves of a
+# larger distance are listed in `Region.coarse`.
 TOLERANCE = 1e-9
 
-# The same by a criterion of one number, whose slopes are differences: each of its values takes milliseconds.
+# The same for a scalar criterion, whose slopes are differences: each value takes milliseconds.
 TOLERANCE_OF_DIFFERENCES = 1e-6
 
-# The number of bisections of the segments of a boundary from verdicts, without steps.
+# The number of bisections of the segments of a boundary without steps that is located by verdicts.
 HALVINGS = 3
 
-# The distance in radians of an eigenvalue's angle from 0 or π below which its phase is computed anew.
+# The distance in radians of an eigenvalue's angle from 0 or π below which its phase is computed again.
 FOLD = 0.1
 
 # Points compared with all curves in one batch.
@@ -97,14 +96,13 @@ ClosedAt = Callable[[Sequence[float]], tuple[ClosedLoop, ...]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Curve:
-    """A piece of the boundary made by one mode; the stable side is on the left of the points' order.
+    """A piece of the boundary with one critical mode; the stable side is on the left of the points' order.
 
-    `points` (k, 2) are in SI, as are `handles` (k − 1, 2, 2): from each point to the next goes the cubic
-    Bézier curve with these two control points between, a straight line if not `smooth` (where events
-    coincide, in the steps over two times, and with passive hands). `error` bounds the curve's distance from
-    the true boundary, relative to the coordinate in which it makes the smaller difference, `distance` the
-    same in units of the ranges. `knots` (m, 2) are the points solved for, in SI, and `eigenvalues` (m,) those
-    that decide there.
+    `points` (k, 2) and `handles` (k − 1, 2, 2) are in SI: two consecutive points are joined by the cubic
+    Bézier curve with these two control points, a straight line unless `smooth` (coincident events, two times,
+    passive hands). `error` bounds the curve's distance from the true boundary, relative to the coordinate in
+    which the difference is smaller, `distance` the distance in units of the ranges. `knots` (m, 2) are the
+    points solved for, in SI, and `eigenvalues` (m,) the critical eigenvalues there.
     """
 
     points: Floats
@@ -120,7 +118,7 @@ class Curve:
 
     @property
     def mode(self) -> str:
-        """The name of the closed system that makes the boundary here, or the criterion that does."""
+        """The name of the closed system with the critical mode, or the name of the criterion."""
         if self.closed_at is None:
             return self.criterion
         middle = len(self.knots) // 2
@@ -128,9 +126,8 @@ class Curve:
 
     @property
     def frequency_hz(self) -> tuple[float, float]:
-        """The smallest and the largest frequency of the critical mode along the curve.
-
-        Both are NaN if unknown.
+        """The smallest and the largest frequency in Hz of the critical mode along the curve, NaN if
+        unknown.
         """
         if self.closed_at is None:
             return np.nan, np.nan
@@ -141,17 +138,19 @@ class Curve:
             indices |= {0, len(self.knots) - 1}
         values: list[float] = []
         for index in sorted(indices):
-            _, turn, frame = _identify(self.closed_at, self.knots[index], complex(self.eigenvalues[index]))
-            if np.isnan(turn):
+            _, phase_advance, frame = _identify(
+                self.closed_at, self.knots[index], complex(self.eigenvalues[index])
+            )
+            if np.isnan(phase_advance):
                 return np.nan, np.nan
-            # turn = 2πm ± angle, and so is it along the curve.
+            # The phase advance is 2πm ± angle, with constant m and sign along the curve.
             candidates = [
-                2 * np.pi * round((turn - sign * float(angles[index])) / (2 * np.pi)) + sign * angles
+                2 * np.pi * round((phase_advance - sign * float(angles[index])) / (2 * np.pi)) + sign * angles
                 for sign in (1, -1)
             ]
-            local = min(candidates, key=lambda candidate: abs(float(candidate[index]) - turn))
-            listed = local if len(indices) == 1 else local[[index]]
-            values += (np.abs(listed) / (2 * np.pi * frame)).tolist()
+            advance = min(candidates, key=lambda candidate: abs(float(candidate[index]) - phase_advance))
+            used = advance if len(indices) == 1 else advance[[index]]
+            values += (np.abs(used) / (2 * np.pi * frame)).tolist()
         return min(values), max(values)
 
 
@@ -160,10 +159,10 @@ class Region(Result):
     """The stable region of a rectangle of two parameters.
 
     `stable_area` is in the product of the axes' units. `cell` are the sides of the coarse cells in SI,
-    `finest` the relative size of the finest. `corner` is whether the corner of both lower ends is stable,
-    `stepped` whether the boundary is accurate to a cell only (time parameters), `tolerance` that of smooth
-    curves (see `coarse`), `linearized` whether the model is nonlinear; `criterion` is the stability
-    criterion; `limitations` lists the limitations of the analysis.
+    `finest` the relative size of the finest. `corner` states whether the corner of both lower ends is stable,
+    `stepped` whether the boundary is accurate to a cell only (time parameters), `tolerance` is that of smooth
+    curves (see `coarse`), `linearized` states whether the model is nonlinear; `criterion` is the stability
+    criterion; `limitations` are the limitations of the result.
     """
 
     shown_by = "region_output:region"
@@ -191,7 +190,7 @@ class Region(Result):
 
     @property
     def rectangle(self) -> Rectangle:
-        """The ranges."""
+        """The rectangle of the two ranges."""
         return rectangle_of(self.x, self.y)
 
     def to_dataframe(self) -> pandas.DataFrame:
@@ -204,7 +203,7 @@ class Region(Result):
         return self._plotted(ax, style=style)
 
     def contains(self, x: Any, y: Any) -> Any:
-        """Return whether points are stable: by the curves or, nearer than their error, by eigenvalues.
+        """Return whether points are stable: by the curves or, within their error, by analyses.
 
         Parameters
         ----------
@@ -213,56 +212,53 @@ class Region(Result):
 
         Returns
         -------
-        bool, or an array of them.
+        A bool, or an array of bool.
 
         Raises
         ------
         ApcError
             E904 a point outside the rectangle.
         """
-        wide, high = np.broadcast_arrays(np.asarray(x, np.float64), np.asarray(y, np.float64))
-        values = np.stack([wide.ravel(), high.ravel()], axis=1)
+        x_values, y_values = np.broadcast_arrays(np.asarray(x, np.float64), np.asarray(y, np.float64))
+        values = np.stack([x_values.ravel(), y_values.ravel()], axis=1)
         points = self.rectangle.points(values)
         if not np.all((points >= 0) & (points <= 1)):
             ranges = " and ".join(
                 f"{axis.free.label} in {float(axis.low):g} to {float(axis.high):g} {axis.unit}"
                 for axis in (self.x, self.y)
             )
-            raise ApcError(Diagnostic("E904", LOCATION, "a point", ranges, "one outside"))
-        inside, near = side_of_curves(self, points)
-        if near.any():
-            inside[near] = _decide(self, values[near])
-        return bool(inside[0]) if wide.ndim == 0 else inside.reshape(wide.shape)
+            raise ApcError(Diagnostic("E904", LOCATION, "point", ranges, "one outside"))
+        stable, near_boundary = side_of_curves(self, points)
+        if near_boundary.any():
+            stable[near_boundary] = _stable_by_analysis(self, values[near_boundary])
+        return bool(stable[0]) if x_values.ndim == 0 else stable.reshape(x_values.shape)
 
 
 @part("region")
 def region(
-    system: Model,
+    numeric: NumericModel,
     axes: tuple[Range, Range],
     *,
     cells: int = CELLS,
     tolerance: float | None = None,
     criterion: str | None = None,
-    prepared: Prepared | None = None,
     progress: Progress | None = None,
 ) -> Region:
-    """Compute the boundary of the stable region of two parameters.
+    """Return the stable region of two parameters, with its boundary curves and area.
 
     Parameters
     ----------
-    system
-        The model; all other parameters keep its values.
+    numeric
+        The model with its parameter values; all other parameters keep them.
     axes
         The two parameters, from `parse_axes`.
     cells
         The initial number of cells along each side of the rectangle.
     tolerance
-        Largest distance between curves and boundary, relative to a coordinate; curves that could not be
-        followed so closely are `Region.coarse`. None: `TOLERANCE`, in mean square `TOLERANCE_OF_DIFFERENCES`.
+        Largest distance between curves and boundary, relative to a coordinate; curves of a larger distance
+        are `Region.coarse`. None: `TOLERANCE`, for a scalar criterion `TOLERANCE_OF_DIFFERENCES`.
     criterion
-        "mean-square" or "nominal", see `critical_values.critical`.
-    prepared
-        From `numeric_model.prepare`, of this model with any parameter values.
+        "mean-square", "nominal" or "passive", see `critical_values.critical`.
     progress
         Called with a text on the progress.
 
@@ -270,133 +266,128 @@ def region(
     ------
     ApcError
         E896 a parameter of an unreliable link; E905 the model cannot be analyzed everywhere in the rectangle,
-        or rounding prevents locating the boundary; and those of `analysis.lifted_groups`.
+        or rounding prevents locating the boundary; and the errors of `analysis.lifted_groups`.
 
     Notes
     -----
-    Where one axis is a delay, the rectangle is cut where events coincide (see `delay_strips`). Along a period
-    it is cut halfway between the analyzed periods (see `clock_periods`), unless all times scale with it.
-    If both axes are times, each point is analyzed separately, and the boundary is a line from cell edge to
-    cell edge with the error of a cell. A model whose start, and so its linearization, depends on an axis is
-    analyzed point by point if its neutral modes change. With passive hands there are no steps: points are on
-    the boundary, with straight segments between, and the error is estimated at their middles.
+    If one axis is a delay, the rectangle is divided into strips where events coincide (see `delay_strips`).
+    Along a period the strips end halfway between analyzed periods (see `clock_periods`), unless all times
+    scale with the period. If both axes are times, each point is analyzed separately, and the boundary is a
+    line from cell edge to cell edge with the error of a cell. A model whose linearization point depends on an
+    axis is analyzed point by point if its neutral modes change. With passive hands points on the boundary are
+    joined by straight segments, with errors estimated at their middles.
     """
-    free = tuple(axis.free for axis in axes)
-    meant = criterion_of(system, criterion, LOCATION, free)
-    tolerance = tolerance or (TOLERANCE_OF_DIFFERENCES if meant in SCALAR_CRITERIA else TOLERANCE)
-    for item in free:
-        if meant == NOMINAL:
-            refuse_channel_number(system, item, LOCATION, instead=f"--criterion {MEAN_SQUARE}")
+    system = numeric.model
+    parameter_refs = tuple(axis.free for axis in axes)
+    chosen_criterion = criterion_of(system, criterion, LOCATION, parameter_refs)
+    tolerance = tolerance or (TOLERANCE_OF_DIFFERENCES if chosen_criterion in SCALAR_CRITERIA else TOLERANCE)
+    for parameter_ref in parameter_refs:
+        if chosen_criterion == NOMINAL:
+            refuse_channel_number(system, parameter_ref, LOCATION, instead=f"--criterion {MEAN_SQUARE}")
         else:
-            refuse_time(system, item, LOCATION, meant)
+            refuse_timing_parameter(system, parameter_ref, LOCATION, chosen_criterion)
     rectangle = rectangle_of(*axes)
     with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
-        prepared = prepared or prepare(system)
-        affine = all(prepared.jacobians[group.peer_type].affine for group in system.groups)
-        times = [index for index, item in enumerate(free) if reaches_time(system, item)]
-        counts = [index for index, item in enumerate(free) if reaches_count(system, item)]
+        kinds = [kind_for_parameter(system, parameter_ref) for parameter_ref in parameter_refs]
+        timed = [index for index, kind in enumerate(kinds) if kind is not EvaluatorKind.MATRICES]
+        counts = [axes[index] for index in timed if kinds[index] is EvaluatorKind.COUNTS]
         if counts:
-            _check_count(axes[counts[0]], len(counts) == 2, bool(times), meant, affine=affine)
-        times = [] if meant in SCALAR_CRITERIA else times + counts
-        # Where every time scales with a period the frame is the same at all values, but for its length.
-        scales = len(times) == 1 and not counts and _scales(system, free[times[0]])
-        times = [] if scales else times
-        _refuse_two_times(system, [free[index] for index in times])
-        starts = () if meant in SCALAR_CRITERIA else _starts(system, prepared, free, rectangle)
-        start = starts[0].prepared if len(starts) == 1 else None
-        striped: TracedRegion | None = None
-        if not starts or times or scales:
-            plane = _points_plane(system, free, rectangle, prepared, meant, stepped=bool(times))
-            if meant == NOMINAL and not times:
+            _check_count(
+                counts[0], len(counts) == 2, len(timed) > len(counts), chosen_criterion, affine=numeric.affine
+            )
+        timed = [] if chosen_criterion in SCALAR_CRITERIA else timed
+        # If every time scales with a period, frames differ in their length only.
+        scales = [kinds[index] for index in timed] == [EvaluatorKind.PERIODS] and is_scaled(
+            system, parameter_refs[timed[0]], delays=True
+        )
+        times = [] if scales else timed
+        _refuse_two_times(system, [parameter_refs[index] for index in times])
+        linearized = evaluator_for(numeric, parameter_refs, chosen_criterion).linearized
+        if len(linearized) > 1 and _number_of_sides_changes(numeric, parameter_refs, rectangle):
+            linearized = ()
+        start = linearized[0] if len(linearized) == 1 else None
+        traced_region: TracedRegion | None = None
+        if timed or not linearized:
+            plane = _points_plane(numeric, parameter_refs, rectangle, chosen_criterion, stepped=bool(times))
+            if chosen_criterion == NOMINAL and not times:
                 tolerance = max(tolerance, TOLERANCE_OF_DIFFERENCES)
             if start is not None and len(times) == 1:
-                striped = trace_delay_strips(
-                    system, axes, times[0], start, cells=cells, tolerance=tolerance, progress=progress
+                traced_region = trace_delay_strips(
+                    start, axes, times[0], cells=cells, tolerance=tolerance, progress=progress
                 )
         else:
             source = JoinedEvaluator(
                 system,
-                free,
-                tuple(
-                    evaluator_of_many(side.system, free, LOCATION, prepared=side.prepared) for side in starts
-                ),
+                parameter_refs,
+                tuple(evaluator_of_many(start, parameter_refs, LOCATION) for start in linearized),
             )
             plane = _Plane(family_over(source, rectangle, source.errors), source.closed_at, stepped=False)
             try:
-                striped = _surveyed(plane, cells, tolerance, progress)
+                traced_region = _trace_plane(plane, cells, tolerance, progress)
             except ApcError as error:
-                # Other motions are free, or there is a kink, where it starts elsewhere.
-                if error.mistakes[0].code not in ("E808", "E905") or parameters_suffice(system, prepared):
+                # Rigid modes differ, or peers start at a kink, for other values.
+                if error.mistakes[0].code not in ("E808", "E905") or parameters_suffice(numeric):
                     raise
                 if start is None:
-                    plane = _points_plane(system, free, rectangle, prepared, meant, stepped=False)
+                    plane = _points_plane(numeric, parameter_refs, rectangle, chosen_criterion, stepped=False)
                 else:
-                    plane = _pieces_plane(system, source.sources[0], rectangle, prepared, start)
-        stepped = plane.stepped and striped is None
-        striped = striped or _surveyed(plane, cells, tolerance, progress)
-        curves = tuple(_curve(plane, arc, meant) for arc in striped.arcs)
-    whole = float(rectangle.width.prod())
+                    plane = _pieces_plane(numeric, source.sources[0], rectangle, start)
+        stepped = plane.stepped and traced_region is None
+        traced_region = traced_region or _trace_plane(plane, cells, tolerance, progress)
+        curves = tuple(_curve(plane, arc, chosen_criterion) for arc in traced_region.arcs)
+    area_unit = float(rectangle.width.prod())
     return Region(
         topology=system.name,
         x=axes[0],
         y=axes[1],
         curves=curves,
-        stable_area=striped.area * whole,
-        stable_area_error=striped.error_bound * whole,
-        cell=(striped.cell[0] * float(rectangle.width[0]), striped.cell[1] * float(rectangle.width[1])),
-        finest=striped.finest,
-        corner=striped.corner,
+        stable_area=traced_region.area * area_unit,
+        stable_area_error=traced_region.error_bound * area_unit,
+        cell=(
+            traced_region.cell[0] * float(rectangle.width[0]),
+            traced_region.cell[1] * float(rectangle.width[1]),
+        ),
+        finest=traced_region.finest,
+        corner=traced_region.corner,
         stepped=stepped,
         tolerance=tolerance,
-        linearized=not affine,
-        criterion=meant,
+        linearized=not numeric.affine,
+        criterion=chosen_criterion,
         limitations=(
-            *near_start(system, prepared),
-            *limitations(system, network=meant != MEAN_SQUARE, varied=free),
-            *(replaced_hands(system) if meant == PASSIVE else ()),
-            *notes_for_all_groups(system, free),
+            *near_start(numeric),
+            *limitations(system, network=chosen_criterion != MEAN_SQUARE, varied=parameter_refs),
+            *(replaced_hands(system) if chosen_criterion == PASSIVE else ()),
+            *notes_for_all_groups(system, parameter_refs),
         ),
         system=system,
     )
 
 
-def _starts(
-    system: Model, prepared: Prepared, free: tuple[ParameterRef, ...], rectangle: Rectangle
-) -> tuple[Side, ...]:
-    """Return the models at the start, one for each side of a kink, with their Jacobians linearized there.
-
-    Empty where the start does not decide, or where the number of sides changes over the rectangle.
-    """
-    kink_sides = sides(system, prepared)
-    if len(kink_sides) > 1:
-        for value in rectangle.values(INSIDE).tolist():
-            elsewhere = apply(system, overrides_at(system, free, value))
-            if len(sides(elsewhere, prepared)) != len(kink_sides):
-                return ()
-    starts = [prepare_at_start(side.system, side.prepared, free) for side in kink_sides]
-    return tuple(
-        replace(side, prepared=start)
-        for side, start in zip(kink_sides, starts, strict=True)
-        if start is not None and None not in starts
+def _number_of_sides_changes(
+    numeric: NumericModel, parameter_refs: tuple[ParameterRef, ...], rectangle: Rectangle
+) -> bool:
+    """Return whether the number of sides of the kinks at the start differs in the rectangle."""
+    elsewhere = (
+        numeric.at(apply(numeric.model, overrides_at(numeric.model, parameter_refs, value)))
+        for value in rectangle.values(INSIDE).tolist()
     )
-
-
-def _scales(system: Model, free: ParameterRef) -> bool:
-    return reaches_period(system, free) and is_scaled(system, free, delays=True)
+    return any(len(sides(changed)) != len(sides(numeric)) for changed in elsewhere)
 
 
 def _refuse_two_times(system: Model, times: Sequence[ParameterRef]) -> None:
-    """Refuse a period together with another time, unless all clocks scale with it: ApcError E903."""
+    """Raise ApcError E903 for a period together with another time, unless all clocks scale with the
+    period.
+    """
     if len(times) < 2:
         return
-    for free in times:
-        if reaches_period(system, free) and not is_scaled(system, free):
-            message = f"{free.label} is a period, and the other axis a time: their frames are too long"
-            raise ApcError(Diagnostic("E903", LOCATION, message, hint=f"apc critical {free.label}"))
+    for parameter_ref in times:
+        if reaches_period(system, parameter_ref) and not is_scaled(system, parameter_ref):
+            message = f"{parameter_ref.label} is a period and the other axis a time; the frames are too long"
+            raise ApcError(Diagnostic("E903", LOCATION, message, fix=f"apc critical {parameter_ref.label}"))
 
 
 def _check_count(axis: Range, both: bool, timed: bool, meant: str, *, affine: bool) -> None:
-    """Raise ApcError E903 for a number of peers on an axis where the region cannot be drawn in steps.
+    """Raise ApcError E903 for a number of peers on an axis if the region cannot be computed in steps.
 
     Parameters
     ----------
@@ -411,19 +402,22 @@ def _check_count(axis: Range, both: bool, timed: bool, meant: str, *, affine: bo
     """
     reasons = {
         "two numbers of peers": both,
-        "a time beside it": timed,
-        f"what is stable {SCALAR_CRITERIA.get(meant, '')}": meant in SCALAR_CRITERIA,
-        "a topology that is not linear": not affine,
+        "a time on the other axis": timed,
+        f"a region of stability {SCALAR_CRITERIA.get(meant, '')}": meant in SCALAR_CRITERIA,
+        "a nonlinear topology": not affine,
     }
     why = next((text for text, applies in reasons.items() if applies), "")
     if why:
-        message = f"{axis.free.label} is a number of peers: no steps are drawn for {why}"
-        raise ApcError(Diagnostic("E903", LOCATION, message, hint=f"apc critical {axis.free.label}"))
+        message = f"{axis.free.label} is a number of peers, which is not supported with {why}"
+        raise ApcError(Diagnostic("E903", LOCATION, message, fix=f"apc critical {axis.free.label}"))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Plane:
-    """The systems over the unit square; `stepped`: known at single points only, by verdicts."""
+    """The matrices over the unit square, with a closed system at each point.
+
+    `stepped` states that only verdicts at single points are known.
+    """
 
     family: DirectFamily
     closed_at: ClosedAt | None
@@ -432,51 +426,50 @@ class _Plane:
 
 
 def _points_plane(
-    system: Model,
-    free: tuple[ParameterRef, ...],
+    numeric: NumericModel,
+    parameter_refs: tuple[ParameterRef, ...],
     rectangle: Rectangle,
-    prepared: Prepared,
-    meant: str,
+    criterion: str,
     *,
     stepped: bool,
 ) -> _Plane:
-    """Return the evaluator of a scalar criterion; `stepped`: a time or a number of peers varies."""
-    source = RadiusEvaluator(system, free, prepared, LOCATION, meant)
-    # One point's bounds are enough, and dear.
+    """Return the plane of a model evaluated point by point; `stepped`: a time or a number of peers varies."""
+    source = RadiusEvaluator(numeric, parameter_refs, LOCATION, criterion)
+    # Bounds are expensive: one point represents the rectangle.
     (errors,) = source.errors(rectangle.values(np.array([[0.5, 0.5]])))
     family = DirectFamily(source, rectangle, (DrivingPart(0, np.arange(1)),), (errors[0],))
-    closed = partial(closed_at, system, free, prepared) if meant == NOMINAL else None
+    closed = partial(closed_at, numeric, parameter_refs) if criterion == NOMINAL else None
     # The energy from hands is measured by the required damping, which is discontinuous.
-    halvings = HALVINGS if meant == PASSIVE else 0
-    return _Plane(family, closed, stepped or meant == PASSIVE, halvings)
+    halvings = HALVINGS if criterion == PASSIVE else 0
+    return _Plane(family, closed, stepped or criterion == PASSIVE, halvings)
 
 
 def _pieces_plane(
-    system: Model,
+    numeric: NumericModel,
     source: BatchEvaluator,
     rectangle: Rectangle,
-    prepared: Prepared,
-    start: Prepared,
+    start: NumericModel,
 ) -> _Plane:
-    """Return the frame matrices of a model whose neutral modes change within the rectangle."""
+    """Return the plane of a model whose neutral modes change within the rectangle."""
     size = sum(len(closed.matrix) for closed in source.closed)
-    pieces = PiecewiseEvaluator(system, source.free, start, size)
+    pieces = PiecewiseEvaluator(start, source.free, size)
     (errors,) = pieces.errors(rectangle.values(np.array([[0.5, 0.5]])))
     family = DirectFamily(pieces, rectangle, (DrivingPart(0, np.arange(size)),), (errors[0],))
-    return _Plane(family, partial(closed_at, system, source.free, prepared), stepped=False)
+    return _Plane(family, partial(closed_at, numeric, source.free), stepped=False)
 
 
-def _surveyed(plane: _Plane, cells: int, tolerance: float, progress: Progress | None) -> TracedRegion:
-    """Survey the whole rectangle and follow the boundary through it, or go by steps from cell to cell."""
-    deciding = Eigenvalues(plane.family)
+def _trace_plane(plane: _Plane, cells: int, tolerance: float, progress: Progress | None) -> TracedRegion:
+    """Return the boundary through the whole rectangle, as smooth curves or by steps from cell to cell."""
+    eigenvalues = Eigenvalues(plane.family)
     evaluations = 0
 
     def samples(points: Floats) -> Floats:
+        """Return the logarithms of the largest magnitudes at points, and report the progress."""
         nonlocal evaluations
         evaluations += len(points)
         if progress:
-            progress(f"looking at {counted(evaluations, 'point')}")
-        return _samples(plane, points)
+            progress(f"{counted(evaluations, 'point')} evaluated")
+        return _log_magnitudes_at(plane, points)
 
     if plane.stepped:
         result = survey(samples, cells=cells)
@@ -489,8 +482,8 @@ def _surveyed(plane: _Plane, cells: int, tolerance: float, progress: Progress | 
         area, error_bound = stable_area(arcs, result)
     else:
         offset = plane.family.rectangle.offset
-        arcs, result, area, error_bound = traced(
-            deciding, samples, cells=cells, tolerance=tolerance, offset=offset
+        arcs, result, area, error_bound = survey_and_trace(
+            eigenvalues, samples, cells=cells, tolerance=tolerance, offset=offset
         )
     if error_bound >= 1:  # of the unit square: the boundary may be anywhere in it
         raise blurred()
@@ -499,34 +492,35 @@ def _surveyed(plane: _Plane, cells: int, tolerance: float, progress: Progress | 
     )
 
 
-def _samples(plane: _Plane, points: Floats) -> Floats:
-    """Return the logarithms of the largest magnitudes, or raise the error of a point."""
+def _log_magnitudes_at(plane: _Plane, points: Floats) -> Floats:
+    """Return the logarithms of the largest magnitudes at points (k, 2).
+
+    A point without matrices raises its error.
+    """
     source, rectangle = plane.family.evaluator, plane.family.rectangle
     matrices = plane.family.matrices(points)
     for matrix in matrices:
-        wrong = np.flatnonzero(~np.isfinite(matrix).all(axis=(1, 2)))
-        if len(wrong):
-            value = rectangle.values(points[wrong[:1]])[0].tolist()
+        invalid = np.flatnonzero(~np.isfinite(matrix).all(axis=(1, 2)))
+        if len(invalid):
+            value = rectangle.values(points[invalid[:1]])[0].tolist()
             overrides = overrides_at(source.system, source.free, value)
-            apply(source.system, overrides)  # reports an unavailable value itself
+            apply(source.system, overrides)  # raises its own error for an invalid value
             if plane.closed_at is not None:
                 plane.closed_at(value)
-            message = (
-                "the topology's frame leaves the range of floating point numbers in part of the rectangle"
-            )
-            raise ApcError(Diagnostic("E905", LOCATION, message, hint="a smaller range"))
+            message = "floating-point overflow in a part of the rectangle"
+            raise ApcError(Diagnostic("E905", LOCATION, message, advice="use a smaller range"))
     return log_magnitudes(matrices, BRANCHES)
 
 
 def _dominant(plane: _Plane, point: Floats) -> complex:
-    """Return the eigenvalue that decides at a point (2,) where one number is known."""
+    """Return the dominant eigenvalue, or the criterion value, at a point (2,) of a pointwise evaluator."""
     source, rectangle = plane.family.evaluator, plane.family.rectangle
     assert isinstance(source, RadiusEvaluator), "one number is known"
     return source.dominant(rectangle.values(point).tolist())
 
 
 def _curve(plane: _Plane, arc: BoundaryArc, criterion: str) -> Curve:
-    """Return an arc in SI."""
+    """Return an arc of the unit square as a curve in SI."""
     rectangle, values = plane.family.rectangle, arc.values
     if arc.smooth and criterion == NOMINAL and isinstance(plane.family.evaluator, RadiusEvaluator):
         values = np.array([_dominant(plane, point) for point in just_inside(arc.knots)])
@@ -545,59 +539,61 @@ def _curve(plane: _Plane, arc: BoundaryArc, criterion: str) -> Curve:
 
 
 def _relative_error(arc: BoundaryArc, offset: Floats) -> float:
-    """Return the largest distance from the boundary, relative to the coordinate it changes less."""
+    """Return the largest distance of an arc from the boundary, relative to the coordinate that it
+    changes less.
+    """
     size = relative_to(arc.points, arc.normals, offset)
     errors = np.maximum(np.append(arc.errors, 0.0), np.insert(arc.errors, 0, 0.0)) + arc.rounding
     return float((errors / size).max())
 
 
 def _identify(closed_at: ClosedAt, value: Floats, eigenvalue: complex) -> tuple[str, float, float]:
-    """Return the name of an eigenvalue's closed system, its turn in a frame, and the frame in s."""
+    """Return the name of an eigenvalue's closed system, its phase advance per frame, and the frame in s."""
     closed = closed_at(value.tolist())
     mode, frame_s = mode_near(closed, eigenvalue), closed[0].frame_s
     return mode.family, 2 * np.pi * mode.frequency_hz * frame_s, frame_s
 
 
 def side_of_curves(region: Region, points: Floats) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return whether points (k, 2) of the unit square are stable, and which are too close to a curve.
+    """Return the mask of stable points (k, 2) of the unit square, and the mask of points near a curve.
 
-    From the point straight down, then along the lower edge to its left corner: each crossing of a curve
-    changes sides. Curves are replaced by their chords, which is right farther from them than their sagitta.
+    Each crossing of a curve changes sides, on the way straight down from the point and along the lower edge
+    to its left corner. Curves are replaced by their chords, exact beyond their sagitta.
     """
     rectangle = region.rectangle
     stable = np.full(len(points), region.corner)
-    near = np.zeros(len(points), dtype=bool)
+    near_curve = np.zeros(len(points), dtype=bool)
     for curve in region.curves:
         knots = rectangle.points(curve.points)
         a, b = knots[:-1], knots[1:]
         middle = between(knots, rectangle.points(curve.handles), 0.5)
         sagitta = 1.5 * np.linalg.norm(middle - (a + b) / 2, axis=1)
-        reach = sagitta + curve.distance
+        margin = sagitta + curve.distance
         ends = [knots[0], knots[-1]] if not curve.closed else []
         for start in range(0, len(points), CHUNK):
-            some = slice(start, start + CHUNK)
-            # A chord that ends at the right-hand edge is crossed by what comes from below there, too.
-            x = np.minimum(points[some, 0, None], np.nextafter(1.0, 0.0))
-            y = points[some, 1, None]
+            batch = slice(start, start + CHUNK)
+            # A chord that ends at the right-hand edge also counts for points above it on this edge.
+            x = np.minimum(points[batch, 0, None], np.nextafter(1.0, 0.0))
+            y = points[batch, 1, None]
             chord = b - a
-            over = (a[:, 0] <= x) != (b[:, 0] <= x)
+            spans = (a[:, 0] <= x) != (b[:, 0] <= x)
             height = a[:, 1] + (x - a[:, 0]) * chord[:, 1] / np.where(chord[:, 0] == 0, 1.0, chord[:, 0])
-            crossings = (over & (height < y)).sum(axis=1)
+            crossings = (spans & (height < y)).sum(axis=1)
             crossings += sum(((end[1] == 0.0) & (end[0] < x[:, 0])).astype(int) for end in ends)
-            stable[some] ^= crossings % 2 == 1
+            stable[batch] ^= crossings % 2 == 1
             size = np.maximum(np.square(chord).sum(axis=1), np.finfo(np.float64).tiny)
             along = np.clip(((x - a[:, 0]) * chord[:, 0] + (y - a[:, 1]) * chord[:, 1]) / size, 0, 1)
             separation = np.hypot(x - a[:, 0] - along * chord[:, 0], y - a[:, 1] - along * chord[:, 1])
-            near[some] |= (separation <= reach).any(axis=1)
-    return stable, near
+            near_curve[batch] |= (separation <= margin).any(axis=1)
+    return stable, near_curve
 
 
-def _decide(region: Region, values: Floats) -> NDArray[np.bool_]:
+def _stable_by_analysis(region: Region, values: Floats) -> NDArray[np.bool_]:
     """Return whether parameter values (k, 2) are stable, by one analysis each."""
-    prepared = prepare(region.system)
+    numeric = numeric_model(region.system)
     decided = []
     for value in values.tolist():
         overrides = overrides_at(region.system, (region.x.free, region.y.free), value)
-        verdict = verdict_with(region.system, prepared, overrides, LOCATION, criterion=region.criterion)
+        verdict = verdict_with(numeric, overrides, LOCATION, criterion=region.criterion)
         decided.append(bool(verdict.stable))
     return np.array(decided, dtype=bool)

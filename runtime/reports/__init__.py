@@ -1,1 +1,1 @@
-"""Everything that is known of topologies, gathered for a page that is kept and computed again."""
+"""Reports: all results of topologies, on a page that can be recomputed."""

@@ -2,8 +2,8 @@
 
 Takes: topologies and settings.
 Gives: `Section`, `TopologyReport`, `Report`; `report`; `differences`.
-Guarantees: every number is that of the command beside it; a section that a topology can't fill says why. A
-report keeps the topology's own texts, so that it can be computed anew from itself alone.
+Guarantees: every number is from the command shown with it; a section without results has a reason. A
+report contains the texts of the topology, so that it can be recomputed without other files.
 Does not: draw, or write files (see `output.report_output`).
 """
 
@@ -17,43 +17,44 @@ from typing import Any
 
 from apc.analysis.model_size import model_size
 from apc.analysis_report import AnalysisReport, answer
-from apc.comparison.choice import DELAY, LOSS, STIFFNESS, choose
-from apc.comparison.comparison import SchemeComparison, compare
 from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError
 from apc.compiler.timings import part
 from apc.compiler.wording import counted
-from apc.distribution import versions
-from apc.frame.parameter_names import parameter_of, unit_of
 from apc.haptics.device_port import read_frequencies
 from apc.haptics.frequency_response import transparency
-from apc.inputs import open_topology
+from apc.inputs.open_model import open_topology
+from apc.lifting.numeric_model import numeric_model
 from apc.mean_square.mean_square_stability import mean_square_stability
-from apc.parameter_studies.critical_values import critical
-from apc.parameter_studies.margins import STIFFNESSES, coupler_parameters
-from apc.parameter_studies.stability_criteria import MEAN_SQUARE, NOMINAL
+from apc.parameter_values.parameter_names import parameter_of, unit_of
 from apc.regions.axes import parse_axes
 from apc.regions.stable_region import region
 from apc.result import Result
 from apc.simulation.initial_velocity import WATCHED, impulse_text, initial_velocity
 from apc.simulation.motion_classes import MotionVerdict
 from apc.simulation.trajectory import simulate
+from apc.studies.choice import DELAY, LOSS, STIFFNESS, choose
+from apc.studies.comparison import SchemeComparison, compare
+from apc.studies.critical_values import critical
+from apc.studies.margins import STIFFNESSES, coupler_parameters
+from apc.studies.stability_criteria import MEAN_SQUARE, NOMINAL
+from apc.support.distribution import versions
 
 LIBRARIES = ("casadi", "numpy", "scipy", "sympy", "python-flint", "matplotlib")
-MOST_SIMULATED = 60  # peers
+MOST_SIMULATED = 60  # the largest number of peers simulated
 JITTER = "jitter"
-FURTHER = 3  # times the present value a region reaches where the topology says no range
-TRANSPARENCY = ("0.1 Hz", 200)  # the lowest frequency, and how many
-# Numbers computed anew, on another processor or by other libraries, are the same up to this, relatively, and
-# by as much as their own errors; of what is next to nothing beside the others of a list nothing is known.
+FURTHER = 3  # upper end of a region's range, relative to the present value, if the topology has no range
+TRANSPARENCY = ("0.1 Hz", 200)  # the lowest frequency, and the number of frequencies
+# The relative tolerance of recomputed numbers, on another processor or with other libraries, in addition to
+# their errors; and the tolerance of small numbers relative to the largest number in the same list.
 SAME, NOTHING = 1e-6, 1e-9
 
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """A part of a report: `remarks`, `results` shown as text, and `figures`, results with a picture.
+    """A section of a report: `remarks`, `results` as text, and `figures`, results with a picture.
 
-    `refused` is the reason if there is nothing else.
+    `refused` is the reason for a section without results.
     """
 
     key: str
@@ -66,7 +67,10 @@ class Section:
 
 @dataclass(frozen=True, slots=True)
 class TopologyReport:
-    """All of one topology: `texts` are its own files by name, `origin` the digests of all it is made of."""
+    """The report of one topology.
+
+    `texts` are its own files by name, `origin` the digests of all its sources.
+    """
 
     name: str
     description: str
@@ -79,7 +83,7 @@ class TopologyReport:
 
 @dataclass(frozen=True, slots=True)
 class Report(Result):
-    """Topologies side by side; `comparison` is there where they are several."""
+    """The reports of topologies; `comparison` is None for a single topology."""
 
     shown_by = "report_output:report"
 
@@ -91,33 +95,33 @@ class Report(Result):
 
 @part("report")
 def report(paths: Sequence[Path], settings: Sequence[str] = ()) -> Report:
-    """Gather the results of topologies.
+    """Return the report of topologies.
 
     Parameters
     ----------
     paths
-        Topologies.
+        The topology files.
     settings
         Parameters to change first in all of them, each `NAME=QUANTITY`.
 
     Raises
     ------
     ApcError
-        A file or a setting is at fault.
+        A file or a setting is invalid.
     """
     systems = [open_topology(str(path), settings) for path in paths]
     topologies = tuple(_topology(path, system, settings) for path, system in zip(paths, systems, strict=True))
-    alongside, refused = None, ""
+    comparison, refused = None, ""
     if len(systems) > 1:
         try:
-            alongside = compare(systems)
+            comparison = compare(systems)
         except ApcError as error:
-            refused = _why(error)
-    return Report(topologies, alongside, refused, _versions())
+            refused = _error_text(error)
+    return Report(topologies, comparison, refused, _versions())
 
 
 def _versions() -> tuple[tuple[str, str], ...]:
-    """Return the versions of the program and of those libraries that are there."""
+    """Return the versions of the program and of its libraries."""
     result = list(versions())
     for name in LIBRARIES:
         try:
@@ -128,9 +132,10 @@ def _versions() -> tuple[tuple[str, str], ...]:
 
 
 def _topology(path: Path, system: Model, settings: Sequence[str]) -> TopologyReport:
+    """Return the report of one topology, with all sections."""
     words = " ".join(f"--set {shlex.quote(text)}" for text in settings)
     call = f"{shlex.quote(path.name)} {words}".strip()
-    made: tuple[tuple[str, Callable[[Model, str], Section]], ...] = (
+    section_builders: tuple[tuple[str, Callable[[Model, str], Section]], ...] = (
         ("compiled", _compiled),
         ("verdict", _verdict),
         ("limits", _limits),
@@ -140,25 +145,25 @@ def _topology(path: Path, system: Model, settings: Sequence[str]) -> TopologyRep
         ("transparency", _transparency),
     )
     sections = []
-    for key, make in made:
+    for key, make in section_builders:
         try:
             sections.append(make(system, call))
         except ApcError as error:
-            sections.append(Section(key, "", refused=_why(error)))
+            sections.append(Section(key, "", refused=_error_text(error)))
     texts = tuple(_texts(system))
     description = (system.name, system.description, path)
     return TopologyReport(*description, tuple(settings), texts, system.origin.digests, tuple(sections))
 
 
-def _why(error: ApcError) -> str:
-    """Return the first mistake in words."""
+def _error_text(error: ApcError) -> str:
+    """Return the text of the first mistake of an error, without its location."""
     mistake = error.mistakes[0]
-    requested = f" wants {mistake.expected}, got {mistake.got}" if mistake.expected else ""
+    requested = f": expected {mistake.expected}, got {mistake.got}" if mistake.expected else ""
     return f"{mistake.message}{requested}"
 
 
 def _texts(system: Model) -> Iterable[tuple[str, str]]:
-    """Yield the texts of a topology's own: the topology, its tables, its components."""
+    """Yield the names and texts of a topology's own files: the topology, its tables, its components."""
     for name, text in system.origin.texts:
         if PurePath(name).suffix and not name.endswith("/"):
             yield name, text.decode()
@@ -168,15 +173,16 @@ def _texts(system: Model) -> Iterable[tuple[str, str]]:
 
 
 def _compiled(system: Model, call: str) -> Section:
+    """Return the section of the compiled model: warnings, unused items, and size."""
     remarks = [f"Warning: {warning}" for warning in system.warnings]
-    remarks += [f"left out: {name}, as {reason}" for name, reason in system.dropped]
+    remarks += [f"omitted: {name}, as {reason}" for name, reason in system.dropped]
     return Section(
         "compiled", f"apc compile {call.split(' --set')[0]}", tuple(remarks), (model_size(system),)
     )
 
 
-def _answered(system: Model) -> tuple[AnalysisReport, str]:
-    """Return the analysis, proved where that can be had, and the option that proves it."""
+def _analysis(system: Model) -> tuple[AnalysisReport, str]:
+    """Return the analysis, proved if possible, and the option for the proof."""
     try:
         return answer(system, certify=True), " --certify"
     except ApcError:
@@ -184,22 +190,29 @@ def _answered(system: Model) -> tuple[AnalysisReport, str]:
 
 
 def _verdict(system: Model, call: str) -> Section:
-    answer, option = _answered(system)
+    """Return the section of the verdict, with the eigenvalues as figure."""
+    answer, option = _analysis(system)
     command = f"apc analyze {call}{option} --plot eigenvalues.svg"
     return Section("verdict", command, (), (answer,), (answer.analysis,))
 
 
 def _limits(system: Model, call: str) -> Section:
-    requested = [(axis, choice.name, choice.why) for axis, choice in choose(system, ()).items()]
-    return _criticals(system, call, "limits", [item for item in requested if item[0] in (STIFFNESS, DELAY)])
+    """Return the section of the critical stiffness and delay."""
+    parameters = [(axis, choice.name, choice.why) for axis, choice in choose(system, ()).items()]
+    return _criticals(system, call, "limits", [item for item in parameters if item[0] in (STIFFNESS, DELAY)])
 
 
 def _network(system: Model, call: str) -> Section:
+    """Return the section of the lossy network: mean-square stability, critical loss and jitter."""
     loss = choose(system, ())[LOSS]
     channels = [link.channel for link in system.links if link.channel is not None]
     jitters = [(JITTER, channel.jitter, "") for channel in channels if channel.jitter is not None]
     return _criticals(
-        system, call, "network", [(LOSS, loss.name, loss.why), *jitters], mean_square_stability(system)
+        system,
+        call,
+        "network",
+        [(LOSS, loss.name, loss.why), *jitters],
+        mean_square_stability(numeric_model(system)),
     )
 
 
@@ -207,18 +220,30 @@ def _criticals(
     system: Model,
     call: str,
     key: str,
-    requested: Sequence[tuple[str, str, str]],
+    parameters: Sequence[tuple[str, str, str]],
     verdict: Result | None = None,
 ) -> Section:
-    """Return where the verdict changes along what `apc compare` looks at, behind a verdict that is known."""
+    """Return a section of the values of parameters at which the verdict changes.
+
+    Parameters
+    ----------
+    system, call
+        The model, and the arguments of the commands.
+    key
+        The key of the section.
+    parameters
+        For each parameter its role, its name ("" if none), and the reason if there is none.
+    verdict
+        A verdict to be shown first.
+    """
     remarks, plotted = [], []
     results: list[Result] = [] if verdict is None else [verdict]
     commands = [] if verdict is None else [f"apc analyze {call}"]
-    for axis, name, why in requested:
+    for axis, name, why in parameters:
         try:
             result = critical(system, name) if name else None
         except ApcError as error:
-            result, why = None, _why(error)
+            result, why = None, _error_text(error)
         if result is None:
             remarks.append(f"{axis}: {why}")
             continue
@@ -232,31 +257,43 @@ def _criticals(
 
 
 def _region(system: Model, call: str) -> Section:
-    requested: list[str | None] = [None, None]
+    """Return the section of the stable region of two parameters."""
+    axis_texts: list[str | None] = [None, None]
     if len(system.region) < 2:
-        stiff = [free for free in coupler_parameters(system) if unit_of(system, free.name) in STIFFNESSES]
+        stiff = [
+            parameter_ref
+            for parameter_ref in coupler_parameters(system)
+            if unit_of(system, parameter_ref.name) in STIFFNESSES
+        ]
         if len(stiff) < 2:
-            why = "all peers share fewer than two stiffnesses, and the topology says no studies: region:"
+            why = (
+                "fewer than two stiffnesses are common to all peers, and the topology has no studies: region:"
+            )
             return Section("region", "", refused=why)
-        requested = [
-            f"{free.label}=0 N/m:{FURTHER * parameter_of(system, free).value or 1000:g} N/m"
-            for free in stiff[:2]
+        axis_texts = [
+            f"{parameter_ref.label}=0 N/m:{FURTHER * parameter_of(system, parameter_ref).value or 1000:g} N/m"
+            for parameter_ref in stiff[:2]
         ]
     unreliable = any(link.channel is not None for link in system.links)
     criterion = NOMINAL if unreliable else None
-    result = region(system, parse_axes(system, *requested), criterion=criterion)
-    words = [f" --{axis} {shlex.quote(text)}" for axis, text in zip("xy", requested, strict=True) if text]
+    axes = parse_axes(system, *axis_texts)
+    result = region(numeric_model(system), axes, criterion=criterion)
+    words = [f" --{axis} {shlex.quote(text)}" for axis, text in zip("xy", axis_texts, strict=True) if text]
     words += [f" --criterion {NOMINAL}"] if criterion else []
     command = f"apc region {call}{''.join(words)} --out region.svg"
     lossy = command.replace(f"--criterion {NOMINAL}", f"--criterion {MEAN_SQUARE}")
-    text = f"Stable here means with every packet on time. As they are lost and late: {lossy}"
+    text = f"The region is that of the nominal network. With packet loss and jitter: {lossy}"
     return Section("region", command, (text,) if unreliable else (), (result,), (result,))
 
 
 def _response(system: Model, call: str) -> Section:
+    """Return the section of the simulation; a model at rest is simulated with an impulse."""
     if system.peers > MOST_SIMULATED:
-        why = f"{counted(system.peers, 'peer', ',')} are more than the {MOST_SIMULATED} that a report plays"
-        return Section("response", "", refused=f"{why}; apc simulate does")
+        why = (
+            f"{counted(system.peers, 'peer', ',')} exceed the limit of {MOST_SIMULATED} for a "
+            "simulation in a report"
+        )
+        return Section("response", "", refused=f"{why}; use apc simulate")
     duration, remarks = system.experiment.duration, []
     length = "" if duration else f" --duration {shlex.quote(f'{float(WATCHED):g} s')}"
     trajectory = simulate(system, duration=duration or WATCHED)
@@ -264,9 +301,9 @@ def _response(system: Model, call: str) -> Section:
         try:
             struck, subject = initial_velocity(system)
         except ApcError as error:
-            remarks.append(_why(error))
+            remarks.append(_error_text(error))
         else:
-            remarks.append(f"The start is at rest. Here {impulse_text(subject)}")
+            remarks.append(f"The initial state is at rest: {impulse_text(subject)}")
             length += f" --impulse {shlex.quote(subject.partition('.')[0])}"
             trajectory = simulate(struck, duration=duration or WATCHED)
     command = f"apc simulate {call}{length} --plot run.svg"
@@ -274,8 +311,10 @@ def _response(system: Model, call: str) -> Section:
 
 
 def _transparency(system: Model, call: str) -> Section:
+    """Return the section of the transparency."""
     low, count = TRANSPARENCY
-    result = transparency(system, read_frequencies(system, None, low, None, count))
+    frequencies = read_frequencies(system, None, low, None, count)
+    result = transparency(numeric_model(system), frequencies)
     return Section(
         "transparency",
         f"apc transparency {call} --points {count} --out transparency.svg",
@@ -285,40 +324,46 @@ def _transparency(system: Model, call: str) -> Section:
     )
 
 
-# ---- computed anew ----
+# ---- recomputed reports ----
 
 
 def differences(before: Any, now: Any) -> Iterator[str]:
-    """Yield the differences between plain data stored in a report and the same data recomputed.
+    """Yield texts on the differences between plain data stored in a report and the same data recomputed.
 
-    Words differ if they are others; numbers by more than roundings and the errors that stand beside them.
+    Texts differ if they are not equal; numbers if the difference exceeds rounding and their errors.
     """
-    stored, made = dict(_leaves(before)), dict(_leaves(now))
-    for name in {**stored, **made}:
-        cell, least = made.get(name, (None, 0.0))
-        old, below = stored.get(name, (None, 0.0))
+    stored, recomputed = dict(_leaves(before)), dict(_leaves(now))
+    for name in {**stored, **recomputed}:
+        cell, new_error = recomputed.get(name, (None, 0.0))
+        old, stored_error = stored.get(name, (None, 0.0))
         numbers = isinstance(cell, int | float) and isinstance(old, int | float)
-        if cell != old and not (numbers and abs(cell - old) <= max(SAME * abs(cell), least + below)):
+        if cell != old and not (
+            numbers and abs(cell - old) <= max(SAME * abs(cell), new_error + stored_error)
+        ):
             yield f"{name} is {_shown(cell)}, not {_shown(old)}"
 
 
-def _leaves(data: Any, name: str = "", value: float = 0.0) -> Iterator[tuple[str, tuple[Any, float]]]:
-    """Yield what is no list or mapping by its place, and how far off it may be, which no error is itself."""
+def _leaves(data: Any, name: str = "", error: float = 0.0) -> Iterator[tuple[str, tuple[Any, float]]]:
+    """Yield the numbers and texts in nested lists and mappings by path, with their error.
+
+    Entries that are errors themselves are omitted. `error` is the error of the enclosing level.
+    """
     if isinstance(data, Mapping):
         errors = (
             item for key, item in data.items() if key.endswith("error") and isinstance(item, int | float)
         )
-        value = sum(errors) or value
+        error = sum(errors) or error
         for key, item in data.items():
             if "error" not in key:
-                yield from _leaves(item, f"{name}.{key}" if name else key, value)
+                yield from _leaves(item, f"{name}.{key}" if name else key, error)
     elif isinstance(data, list):
         sizes = [abs(item) for item in data if isinstance(item, int | float)]
         for index, item in enumerate(data):
-            yield from _leaves(item, f"{name}[{index + 1}]", max(value, NOTHING * max(sizes, default=0.0)))
+            yield from _leaves(item, f"{name}[{index + 1}]", max(error, NOTHING * max(sizes, default=0.0)))
     else:
-        yield name, (data, value)
+        yield name, (data, error)
 
 
 def _shown(cell: Any) -> str:
+    """Return the text of a number or a text."""
     return f"{cell:.12g}" if isinstance(cell, float) else "nothing" if cell is None else str(cell)

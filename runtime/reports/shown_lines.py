@@ -1,8 +1,8 @@
-"""The lines that a report's page shows, compared with those of the page rendered again.
+"""Comparison of the lines of a report's page with the page rendered again.
 
 Takes: the HTML of two pages without their embedded data. Gives: `line_differences`; `LineDifference`.
-Guarantees: every character of a page counts, and every one of its embedded figures. Where arithmetic may
-differ, numbers may differ by roundings, and a figure's identifiers by their hashes.
+Guarantees: every character of a page and of its embedded figures is compared. Unless the comparison is exact,
+numbers may differ by rounding, and the identifiers in figures by their hashes.
 Does not: read, render or compute a page.
 """
 
@@ -15,11 +15,11 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 
-SAME = 1e-6  # relative, of numbers in text
-ERROR_FACTOR = 10.0  # of an error behind ±, which rounding alone may decide
-FIGURE_UNIT = 0.01  # points, of coordinates in figures
-SIGNIFICANT = 6  # digits, from which on the last one may differ by rounding
-WIDEST = 60  # characters of a line that are reported
+SAME = 1e-6  # relative tolerance of numbers in text
+ERROR_FACTOR = 10.0  # largest ratio of two errors after ±, which may be due to rounding only
+FIGURE_UNIT = 0.01  # tolerance of coordinates in figures, in points
+SIGNIFICANT = 6  # digits of a number whose last digit may differ by rounding
+WIDEST = 60  # characters of a line in the result
 _NUMBER = re.compile(r"\d[\d,]*(?:\.\d+)?(?:e[+-]?\d{1,3})?", re.ASCII)
 _FIGURE = re.compile(r'(?<=src=")data:image/svg\+xml;base64,([A-Za-z0-9+/=]*)(?=")')
 _HASHED = re.compile(r'(?<=["#])[a-z]+[0-9a-f]{10}(?=[")])')
@@ -27,7 +27,7 @@ _HASHED = re.compile(r'(?<=["#])[a-z]+[0-9a-f]{10}(?=[")])')
 
 @dataclass(frozen=True, slots=True)
 class LineDifference:
-    """A line of a file, from 1, with what it shows and what it should show."""
+    """A differing line of a file: its number from 1, the text shown, and the expected text."""
 
     line: int
     shown: str
@@ -42,30 +42,39 @@ class _Line:
 
 
 def line_differences(shown: str, expected: str, *, exact: bool) -> Iterator[LineDifference]:
-    """Yield the lines of a page that differ from an expected page; a line and its figures once.
+    """Yield the lines of a page that differ from the expected page; a line with its figures once.
 
     Parameters
     ----------
     shown
-        The page of a file.
+        The page in a file.
     expected
         The page rendered from recomputed results.
     exact
-        Whether no rounding may differ, as where all results are the same to the last bit.
+        Whether no rounding differences are allowed, for results that are equal to the last bit.
     """
-    left, right = _lines(shown, exact), _lines(expected, exact)
-    pairs = list(zip(left, right, strict=False))
-    if len(left) != len(right):
-        # Lines are missing or inserted: what precedes and follows them is paired from both ends.
+    shown_lines, expected_lines = _lines(shown, exact), _lines(expected, exact)
+    pairs = list(zip(shown_lines, expected_lines, strict=False))
+    if len(shown_lines) != len(expected_lines):
+        # Lines are missing or inserted: the equal lines before and after them are removed from both ends.
         start = next((k for k, pair in enumerate(pairs) if not _equal_lines(*pair, exact)), len(pairs))
-        behind = zip(reversed(left[start:]), reversed(right[start:]), strict=False)
-        rest = min(len(left), len(right)) - start
-        end = next((k for k, pair in enumerate(behind) if not _equal_lines(*pair, exact)), rest)
-        some, others = left[start : len(left) - end], right[start : len(right) - end]
-        last = _Line(left[min(start, len(left) - 1)].number if left else 1, "", False)
-        count = max(len(some), len(others))
+        reversed_pairs = zip(reversed(shown_lines[start:]), reversed(expected_lines[start:]), strict=False)
+        remaining = min(len(shown_lines), len(expected_lines)) - start
+        end = next((k for k, pair in enumerate(reversed_pairs) if not _equal_lines(*pair, exact)), remaining)
+        extra_shown, extra_expected = (
+            shown_lines[start : len(shown_lines) - end],
+            expected_lines[start : len(expected_lines) - end],
+        )
+        end_line = _Line(
+            shown_lines[min(start, len(shown_lines) - 1)].number if shown_lines else 1, "", False
+        )
+        count = max(len(extra_shown), len(extra_expected))
         pairs = [
-            (some[k] if k < len(some) else last, others[k] if k < len(others) else last) for k in range(count)
+            (
+                extra_shown[k] if k < len(extra_shown) else end_line,
+                extra_expected[k] if k < len(extra_expected) else end_line,
+            )
+            for k in range(count)
         ]
     last_number = 0
     for item, other in pairs:
@@ -75,19 +84,19 @@ def line_differences(shown: str, expected: str, *, exact: bool) -> Iterator[Line
 
 
 def _lines(page: str, exact: bool) -> list[_Line]:
-    """Return the lines of a page, those of each figure behind the line that holds it."""
+    """Return the lines of a page; the lines of a figure follow the line that contains the figure."""
     lines = []
     for number, text in enumerate(page.splitlines(), start=1):
         figures: list[str] = []
         lines.append(_Line(number, _FIGURE.sub(partial(_decoded, figures), text), False))
         for figure in figures:
-            plotted = figure if exact else _renumbered(figure)
-            lines += [_Line(number, row, True) for row in plotted.splitlines()]
+            figure_text = figure if exact else _renumbered(figure)
+            lines += [_Line(number, row, True) for row in figure_text.splitlines()]
     return lines
 
 
 def _decoded(figures: list[str], result: re.Match[str]) -> str:
-    """Append the text of a figure to `figures`; return its replacement in the line."""
+    """Append the text of a figure to `figures`; return the replacement in the line."""
     try:
         figures.append(base64.b64decode(result[1], validate=True).decode("utf-8"))
     except (binascii.Error, ValueError):
@@ -96,17 +105,17 @@ def _decoded(figures: list[str], result: re.Match[str]) -> str:
 
 
 def _renumbered(figure: str) -> str:
-    """Return a figure whose hashed identifiers are numbered in their order."""
+    """Return a figure whose hashed identifiers are replaced by numbers in order of appearance."""
     numbers: dict[str, int] = {}
     return _HASHED.sub(lambda result: f"id{numbers.setdefault(result[0], len(numbers))}", figure)
 
 
 def _equal_lines(item: _Line, other: _Line, exact: bool) -> bool:
-    """Return whether two lines show the same."""
+    """Return whether two lines are equal, apart from rounding unless `exact`."""
     if item.text == other.text or exact:
         return item.text == other.text and item.figure == other.figure
     words, expected = (
-        [" ".join(word.split()) for word in _NUMBER.split(each.text)] for each in (item, other)
+        [" ".join(word.split()) for word in _NUMBER.split(line.text)] for line in (item, other)
     )
     numbers = zip(_NUMBER.findall(item.text), _NUMBER.findall(other.text), strict=False)
     return words == expected and all(
@@ -116,7 +125,7 @@ def _equal_lines(item: _Line, other: _Line, exact: bool) -> bool:
 
 
 def _near(item: str, other: str, *, figure: bool, error: bool) -> bool:
-    """Return whether two numbers are the same but for roundings."""
+    """Return whether two numbers are equal apart from rounding; `figure` and `error` select the tolerance."""
     a, b = (float(text.replace(",", "")) for text in (item, other))
     largest = max(a, b)
     if error:
@@ -125,7 +134,7 @@ def _near(item: str, other: str, *, figure: bool, error: bool) -> bool:
 
 
 def _last_digit(text: str) -> float:
-    """Return the unit of a number's last digit, 0 of one with few digits."""
+    """Return the unit of the last digit of a number, 0 for a number with few digits."""
     mantissa, _, power = text.replace(",", "").partition("e")
     _, _, decimals = mantissa.partition(".")
     if "." not in mantissa or len(mantissa.replace(".", "").lstrip("0")) < SIGNIFICANT:
@@ -134,14 +143,15 @@ def _last_digit(text: str) -> float:
 
 
 def _excerpts(shown: str, expected: str) -> tuple[str, str]:
-    """Return two lines from shortly before the place where they differ."""
-    least = min(len(shown), len(expected))
-    index = next((k for k in range(least) if shown[k] != expected[k]), least)
+    """Return excerpts of two lines that begin shortly before the first difference."""
+    shorter = min(len(shown), len(expected))
+    index = next((k for k in range(shorter) if shown[k] != expected[k]), shorter)
     begin = max(0, index - WIDEST // 3)
     return _excerpt(shown, begin), _excerpt(expected, begin)
 
 
 def _excerpt(text: str, begin: int) -> str:
+    """Return at most `WIDEST` characters of a line from an index, with marks for omitted text."""
     part: Sequence[str] = [
         "…" if begin else "",
         text[begin : begin + WIDEST],

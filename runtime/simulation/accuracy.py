@@ -7,9 +7,9 @@ Does not: prove a bound: if the motion is unstable, or contacts open and close, 
 estimate becomes large.
 
 By CVODES the second run has tolerances 100 times tighter. With a fixed step it has half the step, and the
-error is the difference times 1/(1 − 1/2ⁿ) for a method of order n. An exact transition has no error but
-rounding: the second run has every coefficient of the transitions off by one unit in the last place, and the
-difference is what roundings of this size amount to.
+error is the difference times 1/(1 − 1/2ⁿ) for a method of order n. An exact transition has rounding errors
+only: the second run changes every coefficient of the transitions by one unit in the last place, and the
+difference estimates the effect of rounding.
 """
 
 from __future__ import annotations
@@ -28,7 +28,10 @@ from apc.simulation.simulation import Simulation, prepare
 
 @dataclass(frozen=True, slots=True)
 class SignalError:
-    """The largest error of a signal, in SI, at `at` seconds; `relative` is its ratio to the range `span`."""
+    """The largest error of a signal in SI, at the time `at` in s.
+
+    `relative` is its ratio to the range `span`.
+    """
 
     name: str
     unit: str
@@ -38,13 +41,16 @@ class SignalError:
 
     @property
     def relative(self) -> float:
-        """The error as a part of the range, 0 if the signal stays where it is."""
+        """The error divided by the range of the signal; 0 for a constant signal."""
         return self.error / self.span if self.span else 0.0
 
 
 @dataclass(frozen=True, slots=True)
 class ErrorEstimate:
-    """Errors by signal. `kind` is "rounding" or "method"; `compared` is the reference."""
+    """The estimated errors by signal.
+
+    `kind` is "rounding" or "method", `compared` describes the reference run.
+    """
 
     kind: str
     compared: str
@@ -57,7 +63,7 @@ class ErrorEstimate:
 
 
 class AccuracyEstimator:
-    """Processes the blocks of a run and simulates the more accurate run in parallel."""
+    """Compares the blocks of a run with those of a more accurate run, simulated at the same time."""
 
     def __init__(self, closer: Simulation, kind: str, compared: str, factor: float) -> None:
         self.kind, self.compared, self.factor = kind, compared, factor
@@ -68,23 +74,23 @@ class AccuracyEstimator:
         self.low, self.high = np.full(n, np.inf), np.full(n, -np.inf)
 
     def take(self, block: OutputBlock) -> None:
-        """Compare one block; rows that only one of the runs reaches are left out."""
-        other = next(self.blocks, None)
-        rows = min(len(block.time), len(other.time)) if other else 0
-        if not other or not rows:
+        """Update the errors by one block; rows that only one of the runs reaches are left out."""
+        reference = next(self.blocks, None)
+        rows = min(len(block.time), len(reference.time)) if reference else 0
+        if not reference or not rows:
             return
         values = block.values[:rows]
-        separation = self.factor * np.abs(values - other.values[:rows])
-        larger = separation.max(axis=0) > self.error
-        self.at[larger] = block.time[separation.argmax(axis=0)[larger]]
-        self.error = np.maximum(self.error, separation.max(axis=0))
+        errors = self.factor * np.abs(values - reference.values[:rows])
+        larger = errors.max(axis=0) > self.error
+        self.at[larger] = block.time[errors.argmax(axis=0)[larger]]
+        self.error = np.maximum(self.error, errors.max(axis=0))
         self.low, self.high = (
             np.minimum(self.low, values.min(axis=0)),
             np.maximum(self.high, values.max(axis=0)),
         )
 
     def estimate(self) -> ErrorEstimate:
-        """Return the error estimate up to now."""
+        """Return the error estimate over the blocks until now."""
         span = np.where(self.high >= self.low, self.high - self.low, 0.0)
         columns: Sequence[Any] = (self.error.tolist(), self.at.tolist(), span.tolist())
         estimates = (
@@ -95,14 +101,14 @@ class AccuracyEstimator:
 
 
 def compare_with(simulation: Simulation, *, signals: Sequence[str] = ()) -> AccuracyEstimator:
-    """Prepare the closer run of a simulation.
+    """Return the estimator of a simulation's error, with the more accurate run prepared.
 
     Parameters
     ----------
     simulation
         The simulation.
     signals
-        The patterns that it was prepared with.
+        The patterns of the recorded signals, as for `prepare`.
     """
     method, factor = finer(simulation.settings.method, all_linear=not simulation.tolerances)
     closer = prepare(simulation.system, replace(simulation.settings, method=method), signals=signals)

@@ -1,10 +1,10 @@
-"""A C text as a loaded library, by the C compiler of the machine, where it has one.
+"""Compilation of a C text to a loaded library by the C compiler of the machine, if one exists.
 
 Takes: the text of a library. Gives: `native`, `compiler`.
-Guarantees: the roundings of the operations as they are written (no contraction, no reordering); what was
-compiled once is found again by a digest of its text, the compiler and its options; a library is written whole
-or not at all, into a folder of the user's own, and is loaded only as it was written (see `seal`): a damaged
-one is compiled again. None without a compiler or such a folder, or where it fails.
+Guarantees: operations are rounded in the order of the text (no contraction, no reordering). Compiled
+libraries are cached by a digest of the text, the compiler and its options, in a private folder of the user. A
+library is written completely or not at all, and loaded only if it is unchanged (see `seal`); a damaged
+library is compiled again. None without a compiler or a private folder, or if the compilation fails.
 Does not: write the text (see `compiled_engine`).
 """
 
@@ -23,21 +23,21 @@ from apc.compiler.signing import cache_folder, is_sealed, seal
 
 # Contracted products and sums would round differently from CasADi's virtual machine.
 OPTIONS = ("-ffp-contract=off", "-fno-math-errno", "-fPIC", "-shared")
-# Loops over many peers are worth the threefold time that it takes to put them into lanes.
+# For loops over many peers, vectorization is worth its threefold compilation time.
 MANY, FEW = ("-O3", "-DMANY"), ("-O2",)
 COMPILERS = ("cc", "gcc", "clang")
-PATIENCE = 120.0  # seconds; a frame's straight code takes a fraction of one
+TIMEOUT = 120.0  # seconds; a frame's straight code takes a fraction of one
 
 
 def native(text: str, *, many: bool = False) -> ctypes.CDLL | None:
-    """Return a library, None if it can't be had.
+    """Return the library compiled from a C text, None if it is unavailable.
 
     Parameters
     ----------
     text
-        In C.
+        The C text.
     many
-        Whether its loops run often enough to be put into lanes; it sees the macro MANY then.
+        Whether its loops are long enough for vectorization; the macro MANY is then defined.
     """
     pair = compiler()
     options = (*(MANY if many else FEW), *OPTIONS)
@@ -66,7 +66,7 @@ def compiler() -> tuple[str, str] | None:
 
 
 def _library(text: str, pair: tuple[str, str], options: tuple[str, ...]) -> Path | None:
-    """Return the library of a text, compiled now or before; None if it can't be had."""
+    """Return the path of the library of a text, compiled now or earlier; None if it is unavailable."""
     path, version = pair
     digest = hashlib.sha256("\0".join((text, path, version, *options)).encode()).hexdigest()
     folder = cache_folder()
@@ -74,19 +74,21 @@ def _library(text: str, pair: tuple[str, str], options: tuple[str, ...]) -> Path
         return None
     try:
         library, mark = folder / f"{digest}.so", folder / f"{digest}.seal"
-        if _is_ours(library, mark):
+        if _is_unchanged(library, mark):
             return library
         with tempfile.TemporaryDirectory(dir=folder) as name:
-            source, built, sealed = (Path(name) / part for part in ("frames.c", "frames.so", "seal"))
+            source, built, sealed = (
+                Path(name) / file_name for file_name in ("frames.c", "frames.so", "seal")
+            )
             source.write_text(text, encoding="utf-8")
             subprocess.run(
                 [path, *options, str(source), "-o", str(built), "-lm"],
                 cwd=name,  # linkers look for libraries where they are started
                 capture_output=True,
-                timeout=PATIENCE,
+                timeout=TIMEOUT,
                 check=True,
             )
-            sealed.write_text(seal(_sealed(library, built)), encoding="ascii")
+            sealed.write_text(seal(_seal_content(library, built)), encoding="ascii")
             built.replace(library)
             sealed.replace(mark)
     except (OSError, subprocess.SubprocessError):
@@ -94,13 +96,14 @@ def _library(text: str, pair: tuple[str, str], options: tuple[str, ...]) -> Path
     return library
 
 
-def _is_ours(library: Path, mark: Path) -> bool:
-    """Return whether a library exists and is bit-identical to the one compiled under that name."""
+def _is_unchanged(library: Path, mark: Path) -> bool:
+    """Return whether a library exists and is bit-identical to the one compiled under its name."""
     try:
-        return is_sealed(_sealed(library, library), mark.read_text(encoding="utf-8"))
+        return is_sealed(_seal_content(library, library), mark.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return False
 
 
-def _sealed(library: Path, content: Path) -> bytes:
+def _seal_content(library: Path, content: Path) -> bytes:
+    """Return the bytes that the seal of a library covers: its name and its content."""
     return f"{library.name}\0".encode() + content.read_bytes()

@@ -1,12 +1,12 @@
 """All peers' frames in machine code: the kernels as loops over peers, and the engine that runs them.
 
-Takes: a `HeterogeneousGroup`, the packets of its unreliable links.
+Takes: a `Population`, the packets of its unreliable links.
 Gives: `library_of`, `LoadedLibrary`, `CompiledEngine`; `program_text`, the C text; `straight_lines`.
-Guarantees: the numbers of `interpreted_engine` to a few roundings of the sums; the text depends on what a
-peer does in a frame, not on how many peers there are or on their numbers.
+Guarantees: results equal those of `interpreted_engine` to a few roundings of the sums; the text depends on
+the operations of a peer in a frame, not on the number of peers or their parameters.
 Does not: compile (see `c_compiler`), or run kernels that are not straight code, such as solvers.
 
-C, and not numba or LLVM: its compiler is of the machine, where these would be further packages to install.
+C instead of numba or LLVM: a C compiler is usually installed, these would be further packages.
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ from apc.simulation.population import DeliverySource, FrameRows, Population, Pop
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-# More operations and rows of tables than this in one kernel: to optimize straight code takes more than linear
-# time.
+# Limit of operations and rows of tables in one kernel: the optimization of straight-line code takes more than
+# linear time.
 MOST_OPERATIONS = 20_000
-MANY = 32  # peers of a member from which on their loop is put into lanes
+MANY = 32  # least number of peers of a member for a vectorized loop
 KINDS = ("complete", "weighed", "deliver", "look", "move", "work")
 OPERATORS = {"sum": 0, "mean": 0, "max": 1, "min": 2}
 
@@ -93,7 +93,7 @@ EXPRESSIONS = {
     "mul": "{0} * {1}",
     "div": "{0} / {1}",
     "constpow": "pow({0}, {1})",
-    # As C's fmin and fmax, which take the other for what is no number, in a form that goes into lanes.
+    # C's fmin and fmax, which ignore a NaN, in a form that can be vectorized.
     "fmin": "{0} < {1} || {1} != {1} ? {0} : {1}",
     "fmax": "{0} > {1} || {1} != {1} ? {0} : {1}",
     "lt": "{0} < {1}",
@@ -104,7 +104,7 @@ EXPRESSIONS = {
     "or": "{0} || {1}",
     "if_else_zero": "{0} ? {1} : 0.0",
 }
-# In the table t with its last row: the row before `at`, by halving, and what is made of it.
+# Bisection for the row of the table t before `at`, and the slope there.
 SOUGHT = """\
 int low{k} = 0, high{k} = {last};
 while (high{k} - low{k} > 1) {{
@@ -121,7 +121,7 @@ READ_INDEXED = {
 
 
 def _fields(*columns: tuple[str, str]) -> np.dtype[Any]:
-    """Return a structure of `engine.c`: names of fields with their type, all of 8 bytes."""
+    """Return the data type of a structure of `engine.c`: field names with their type, each of 8 bytes."""
     return np.dtype([(name, type_) for names, type_ in columns for name in names.split()])
 
 
@@ -142,14 +142,14 @@ PLAN = _fields(
 
 
 def program_text(kernels: Sequence[tuple[PlainFunction, int]], reads: Sequence[PlainFunction]) -> str:
-    """Return the C text that runs members with these kernels as segments and these pairwise reductions.
+    """Return the C text of the segments' kernels and the pairwise reductions, with the engine.
 
     Parameters
     ----------
     kernels
-        The segments' kernels, each with how many signals it records at a mark.
+        The segments' kernels, each with the number of signals that it records at a sample time.
     reads
-        The functions of pairs (see `pairwise`).
+        The pairwise functions (see `pairwise`).
     """
     parts = [HEAD]
     parts += [_kernel(index, *kernel) for index, kernel in enumerate(kernels)]
@@ -160,13 +160,14 @@ def program_text(kernels: Sequence[tuple[PlainFunction, int]], reads: Sequence[P
     return "\n".join(parts)
 
 
-def _table(name: str, each: str, parameters: str, count: int) -> str:
-    listed = ", ".join(f"{each}{index}" for index in range(count)) or "0"
+def _table(name: str, prefix: str, parameters: str, count: int) -> str:
+    """Return the C text of a table of function pointers."""
+    listed = ", ".join(f"{prefix}{index}" for index in range(count)) or "0"
     return f"static void (*const {name}[])({parameters}) = {{{listed}}};\n"
 
 
 def _kernel(index: int, function: PlainFunction, recorded: int) -> str:
-    """Return a segment's kernel as a loop over peers."""
+    """Return the C text of a segment's kernel, a loop over peers."""
     carry, received, constants, impulses, _ = (rows for _, rows in function.inputs)
     inputs = [
         *(f"carry[{k} * n + i]" for k in range(carry)),
@@ -204,7 +205,7 @@ CLONES static void kernel{index}({PARAMETERS.format(local="int own, ")}) {{
 
 
 def _reduce(index: int, function: PlainFunction) -> str:
-    """Return a function of pairs as a loop over arcs, and what their values are joined to."""
+    """Return the C text of a pairwise function, a loop over arcs that reduces the values at each receiver."""
     local, sent, _, _ = (rows for _, rows in function.inputs)
     inputs = [
         *(f"((const double *)own[{2 * k}])[own[{2 * k + 1}] * r]" for k in range(local)),
@@ -228,7 +229,7 @@ static void look{index}({READ}) {{
 
 
 def straight_lines(function: PlainFunction, inputs: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Return the names of a function's values, and the lines of C that make them."""
+    """Return the C names of a function's values, and the lines of C that compute them."""
     used = {index for _, *indices in function.operations for index in indices}
     used |= {index for indices in function.results for index in indices}
     names, lines = [], []
@@ -242,22 +243,25 @@ def straight_lines(function: PlainFunction, inputs: Sequence[str]) -> tuple[list
         for subject, column in (("times", table.times), ("numbers", table.numbers)):
             listed = ", ".join(map(_number, column.tolist()))
             lines.append(f"static const double {subject}{names[-1]}[{len(column)}] = {{{listed}}};")
-    for word, *indices in function.operations:
+    for operation, *indices in function.operations:
         name = f"v{len(names)}"
-        if word in READ_INDEXED:
-            table, at = (names[index] for index in indices)
-            rows = len(function.tables[indices[0] - len(inputs) - len(function.constants)].times)
-            text = SOUGHT + READ_INDEXED[word]
-            lines += text.format(v=name, k=len(names), at=at, t=table, last=rows - 1).splitlines()
+        if operation in READ_INDEXED:
+            table, argument = (names[index] for index in indices)
+            table_rows = len(function.tables[indices[0] - len(inputs) - len(function.constants)].times)
+            text = SOUGHT + READ_INDEXED[operation]
+            lines += text.format(v=name, k=len(names), at=argument, t=table, last=table_rows - 1).splitlines()
             names.append(name)
             continue
-        form = EXPRESSIONS.get(word, f"{word}({', '.join(f'{{{k}}}' for k in range(len(indices)))})")
+        form = EXPRESSIONS.get(
+            operation, f"{operation}({', '.join(f'{{{k}}}' for k in range(len(indices)))})"
+        )
         lines.append(f"const double {name} = {form.format(*(names[index] for index in indices))};")
         names.append(name)
     return names, lines
 
 
 def _number(value: float) -> str:
+    """Return a float as an exact C literal."""
     if math.isnan(value):
         return "NAN"
     if math.isinf(value):
@@ -267,21 +271,24 @@ def _number(value: float) -> str:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoadedLibrary:
-    """The compiled text of a population; `kernels` are the places of the segments' kernels, by their `id`."""
+    """The loaded library of a population.
+
+    `kernels` are the indices of the segments' kernels by their `id`.
+    """
 
     loaded: ctypes.CDLL
     kernels: Mapping[int, int]
 
 
 def library_of(population: Population) -> LoadedLibrary | None:
-    """Return the compiled engine of a population, None if unavailable."""
+    """Return the compiled library of a population, None if unavailable."""
     segments = {
         id(segment): (segment, m.program) for m in population.members for segment in m.program.segments
     }
     functions = [segment.kernel for segment, _ in segments.values()]
     reads = list(population.exchange_program.functions)
     if ctypes.sizeof(ctypes.c_void_p) != 8 or not all(
-        _is_worth_it(function) for function in (*functions, *reads)
+        _is_compilable(function) for function in (*functions, *reads)
     ):
         return None
     kernels = [(straight(segment.kernel), len(program.recorded)) for segment, program in segments.values()]
@@ -292,7 +299,10 @@ def library_of(population: Population) -> LoadedLibrary | None:
     return LoadedLibrary(loaded, {key: index for index, key in enumerate(segments)})
 
 
-def _is_worth_it(function: Any) -> bool:
+def _is_compilable(function: Any) -> bool:
+    """Return whether a function is straight-line code with at most MOST_OPERATIONS operations and
+    table rows.
+    """
     if not function.is_a("SXFunction"):
         return False
     rows = sum(len(table_of(table).times) for table in function.find_functions(0))
@@ -300,7 +310,7 @@ def _is_worth_it(function: Any) -> bool:
 
 
 class CompiledEngine(PopulationState):
-    """The memory of all peers, and the library that advances it."""
+    """An engine that simulates all peers by compiled code, with their stored values."""
 
     def __init__(
         self,
@@ -308,40 +318,46 @@ class CompiledEngine(PopulationState):
         population: Population,
         timetable: Callable[[int], DeliverySource] | None,
     ) -> None:
-        """Build the input data of the library.
+        """Set up the structures that the compiled code reads.
 
         Parameters
         ----------
         library
-            The population's.
+            The compiled library of the population.
         population, timetable
-            As of `PopulationState`.
+            As for `PopulationState`.
         """
         super().__init__(population, timetable)
         self._play = library.loaded.play
         self._play.argtypes = [ctypes.c_void_p, *[ctypes.c_int64] * 2, *[ctypes.c_void_p] * 2]
-        self._stored: list[NDArray[Any]] = []  # arrays whose addresses the library knows
+        self._stored: list[NDArray[Any]] = []  # arrays whose addresses the library uses
         exchange_program, members = population.exchange_program, population.members
-        heights = [
+        received_rows = [
             max(segment.kernel.numel_in("received") for segment in m.program.segments) for m in members
         ]
         self.received = [
-            self._local(np.zeros((height, member.count)))
-            for height, member in zip(heights, members, strict=True)
+            self._keep(np.zeros((row_count, member.count)))
+            for row_count, member in zip(received_rows, members, strict=True)
         ]
-        self.members = self._local(np.array([self._member(g) for g in range(len(members))], MEMBER))
-        self.routes = self._local(
+        self.members = self._keep(
+            np.array([self._member(member_index) for member_index in range(len(members))], MEMBER)
+        )
+        self.routes = self._keep(
             np.array([self._route(i) for i in range(len(exchange_program.routes))], ROUTE)
         )
         operations = [
-            self._operation("work", g, population.parts.index(part), member.program.layout.work.start + row)
-            for g, member in enumerate(members)
+            self._operation(
+                "work", member_index, population.parts.index(part), member.program.layout.work.start + row
+            )
+            for member_index, member in enumerate(members)
             for row, part in enumerate(member.program.layout.parts)
         ]
-        for index, listed in enumerate(exchange_program.segments):
-            operations += [self._received(operation) for operation in listed]
-            operations += [self._moved(g, index, library) for g in range(len(members))]
-        self.plan = self._local(np.zeros(1, PLAN))
+        for index, exchange_operations in enumerate(exchange_program.segments):
+            operations += [self._exchange_operation(operation) for operation in exchange_operations]
+            operations += [
+                self._propagation(member_index, index, library) for member_index in range(len(members))
+            ]
+        self.plan = self._keep(np.zeros(1, PLAN))
         _set(
             self.plan[0],
             frames_kept=exchange_program.ring,
@@ -353,7 +369,7 @@ class CompiledEngine(PopulationState):
             parts=len(population.parts),
             frame=population.frame,
             packets=self.packets,
-            operation=self._local(np.array(operations, OPERATION)),
+            operation=self._keep(np.array(operations, OPERATION)),
             route=self.routes,
             member=self.members,
         )
@@ -380,16 +396,17 @@ class CompiledEngine(PopulationState):
 
     # ---- the layout
 
-    def _local(self, array: Any) -> NDArray[Any]:
-        """Keep an array, contiguous, as long as the library may look at it."""
+    def _keep(self, array: Any) -> NDArray[Any]:
+        """Return an array as contiguous, stored as long as the library may read it."""
         self._stored.append(np.ascontiguousarray(array))
         return self._stored[-1]
 
-    def _whole(self, array: Any) -> Integers:
-        """Keep an array of whole numbers."""
-        return self._local(np.asarray(array, np.int64))
+    def _keep_integers(self, array: Any) -> Integers:
+        """Return an array of integers as contiguous, stored as long as the library may read it."""
+        return self._keep(np.asarray(array, np.int64))
 
     def _member(self, g: int) -> Any:
+        """Return the structure of one member: its sizes and the addresses of its arrays."""
         member = self.population.members[g]
         subsystems = len(member.parameters)
         return _set(
@@ -402,11 +419,12 @@ class CompiledEngine(PopulationState):
             impulse_rows=member.program.impulse_rows,
             carry=self.carries[g],
             received=self.received[g],
-            constants=self._local(member.each(member.constants).T if subsystems > 1 else member.constants[0]),
-            subsystem=self._whole(member.rows),
+            constants=self._keep(member.each(member.constants).T if subsystems > 1 else member.constants[0]),
+            subsystem=self._keep_integers(member.rows),
         )
 
     def _route(self, index: int) -> Any:
+        """Return the structure of a route: its sizes and the addresses of its arrays."""
         exchange_program = self.population.exchange_program
         route, keys = exchange_program.routes[index], exchange_program.channels[index]
         return _set(
@@ -416,60 +434,68 @@ class CompiledEngine(PopulationState):
             ticks=route.ticks,
             zero=int(route.zero),
             channels=len(keys),
-            columns=self._local(exchange_program.column_of[route.pairs[:, 0]]),
-            keys=self._local(keys),
+            columns=self._keep(exchange_program.column_of[route.pairs[:, 0]]),
+            keys=self._keep(keys),
             held=self.held[index],
             effective=self.effective[index],
         )
 
     def _operation(self, kind: str, *whole: int, **fields: Any) -> Any:
+        """Return the structure of an operation with integer arguments a to g and further fields."""
         record = np.zeros(1, OPERATION)[0]
         return _set(record, kind=KINDS.index(kind), **dict(zip("abcdefg", whole, strict=False)), **fields)
 
-    def _moved(self, g: int, index: int, library: LoadedLibrary) -> Any:
-        """Return the integrators of a member over a segment."""
+    def _propagation(self, g: int, index: int, library: LoadedLibrary) -> Any:
+        """Return the operation that propagates a member over a segment."""
         population = self.population
         segment = population.members[g].program.segments[index]
-        keys = self._whole([population.exchange_program.sent[g][row] for row in segment.sent])
-        where = (library.kernels[id(segment)], segment.first_mark, population.columns[g])
-        return self._operation("move", g, *where, segment.first_impulse, p=keys)
+        keys = self._keep_integers([population.exchange_program.sent[g][row] for row in segment.sent])
+        location = (library.kernels[id(segment)], segment.first_mark, population.columns[g])
+        return self._operation("move", g, *location, segment.first_impulse, p=keys)
 
-    def _read(self, source: Source) -> tuple[int, int, int]:
-        """Return the location of a source: a packet's key and lag, or −1 and an address."""
+    def _source_location(self, source: Source) -> tuple[int, int, int]:
+        """Return the location of a source: a packet's key and lag and 0, or −1, 0 and an address."""
         if isinstance(source, Arrived):
             return -1, 0, self.held[source.route][source.row].ctypes.data
         return source.key, source.lag, 0
 
-    def _received(self, operation: Operation) -> Any:
+    def _exchange_operation(self, operation: Operation) -> Any:
+        """Return the structure of an operation of the packet exchange."""
         match operation:
             case CompleteGraphSum(g, row, packet, ranges, local, divisor):
-                where = (g, packet.key, packet.lag, len(ranges), int(local))
-                to = self.received[g][row]
-                return self._operation("complete", *where, x=divisor, p=self._whole(ranges), v=to)
+                location = (g, packet.key, packet.lag, len(ranges), int(local))
+                target = self.received[g][row]
+                return self._operation(
+                    "complete", *location, x=divisor, p=self._keep_integers(ranges), v=target
+                )
             case WeightedSum(g, row, source, weights):
                 fields = {
-                    "p": self._whole(weights.indptr),
-                    "q": self._whole(weights.indices),
-                    "u": self._local(weights.data),
+                    "p": self._keep_integers(weights.indptr),
+                    "q": self._keep_integers(weights.indices),
+                    "u": self._keep(weights.data),
                 }
-                key, lag, address = self._read(source)
+                key, lag, address = self._source_location(source)
                 return self._operation("weighed", g, key, lag, r=address, v=self.received[g][row], **fields)
             case Deliver(route, tick):
                 return self._operation("deliver", route, tick)
         return self._reduce(operation)
 
     def _reduce(self, reduction: PairwiseReduction) -> Any:
-        """Return the pairwise functions."""
+        """Return the structure of a pairwise reduction."""
         member = self.population.members[reduction.member]
         carry, constants = self.carries[reduction.member], int(self.members["constants"][reduction.member])
-        local = len(member.parameters) > 1
+        own_constants = len(member.parameters) > 1
         rows = [(carry[row].ctypes.data, 1) for row in reduction.pairwise.carry]
-        stride = 8 * (member.count if local else 1)
-        rows += [(constants + stride * row, int(local)) for row in reduction.pairwise.constants]
-        sources = [self._read(source) for source in reduction.sources]
-        listed = [reduction.receivers, np.array(rows, np.int64).ravel(), np.array(sources, np.int64).ravel()]
+        stride = 8 * (member.count if own_constants else 1)
+        rows += [(constants + stride * row, int(own_constants)) for row in reduction.pairwise.constants]
+        sources = [self._source_location(source) for source in reduction.sources]
+        integer_data = [
+            reduction.receivers,
+            np.array(rows, np.int64).ravel(),
+            np.array(sources, np.int64).ravel(),
+        ]
         quantum = member.program.schedule.quantum
-        where = (
+        arguments = (
             reduction.function,
             len(reduction.senders),
             OPERATORS[reduction.operator],
@@ -479,21 +505,21 @@ class CompiledEngine(PopulationState):
         return self._operation(
             "look",
             reduction.member,
-            *where,
+            *arguments,
             reduction.pairwise.now,
             x=float(len(rows)),
             y=float(quantum.numerator),
             z=float(quantum.denominator),
-            p=self._local(reduction.senders),
-            q=self._local(np.concatenate(listed)),
-            u=self._local(reduction.weights),
-            r=self._read(reduction.missing)[2] if reduction.missing else 0,
+            p=self._keep(reduction.senders),
+            q=self._keep(np.concatenate(integer_data)),
+            u=self._keep(reduction.weights),
+            r=self._source_location(reduction.missing)[2] if reduction.missing else 0,
             v=self.received[reduction.member][reduction.row],
         )
 
 
 def _set(record: Any, **fields: Any) -> Any:
-    """Fill in a structure: numbers, and the addresses of arrays."""
+    """Return a structure with its fields set to numbers, or to the addresses of arrays."""
     for name, value in fields.items():
         record[name] = value.ctypes.data if isinstance(value, np.ndarray) else value
     return record

@@ -3,7 +3,7 @@
 Takes: samples of positions at equal intervals. Gives: `Fit`, `Oscillation`, `fit_motion`.
 Guarantees: a rate or a frequency has an error, found from parts of the same samples; where parts disagree the
 error is large.
-Does not: prove anything, or know the equations (see `analysis`).
+Does not: prove anything, or use the equations (see `analysis`).
 
 A motion of a linear system that no force changes is a sum of exponentials z_i^k about a constant and a ramp.
 Second differences remove these two. The poles z_i are those of ESPRIT (Roy and Kailath, IEEE Trans. ASSP 37
@@ -26,32 +26,34 @@ Complexes = NDArray[np.complex128]
 
 PENCIL = 64  # rows of a Hankel matrix
 FEWEST = 24  # samples of a fit
-MOST = 600  # samples of a fit: more make it no better and take longer
-CHANNELS = 4  # positions of a fit, those that move most
-A_PERIOD = 8  # samples in the period of the fastest motion, where there are as many
-NOISE = 1e-9  # singular values below this share of the largest are rounding, or the error of an integration
+MOST = 600  # samples of a fit: more samples take longer without a better fit
+CHANNELS = 4  # positions of a fit, those of the largest range
+A_PERIOD = 8  # samples per period of the fastest motion, if there are enough samples
+NOISE = 1e-9  # share of the largest singular value below which others are rounding or integration errors
 POLES = 20  # the most of a fit
 VISIBLE = 1e-4  # share of the largest amplitude from which a pole counts
-GROWING = 1e-6  # the same of one that grows
-AT_REST = 1e-7  # share of the range of all below which a motion has ended
-SAFETY = 3.0  # times what parts of the samples disagree by
+GROWING = 1e-6  # the same for a growing pole
+AT_REST = 1e-7  # share of the range over the entire motion below which a motion has ended
+SAFETY = 3.0  # factor on the difference between fits of parts of the samples
 SEGMENTS, FEWEST_SEGMENTS = 8, 4  # of the window, for the range over time: each of a period or more
 RAMP = 0.05  # share of the range of the window from which a ramp counts
-# An error of the rate times the window, or of a frequency as a share of it, that leaves open whether a motion
-# oscillates on.
+# The limit of (error of the rate · length of the window), and of the relative error of a frequency, above
+# which a sustained oscillation is undecided.
 OPEN = 0.5
-LARGE = 0.1  # share of the largest amplitude from which a pole that is not known leaves the rate open
+LARGE = 0.1  # share of the largest amplitude from which an uncertain pole adds to the error of the rate
 FADED = 1e-10  # share of the largest second difference from which a sample counts
-STEADY = 0.5  # share of the range of the last quarter that the step to it must be, for a drift
-KEPT_SHARE = 0.8  # share of a step that the next but one must keep, for a drift
-LATE = 0.9  # share of the samples: a motion that ends before has ended
+STEADY = 0.5  # least step to the mean of the last quarter, as a share of this quarter's range, for a drift
+KEPT_SHARE = 0.8  # least ratio of the last step to the first, for a drift
+LATE = 0.9  # share of the samples before which a motion must end to count as ended
 UNIT = float(np.finfo(np.float64).eps)
-PARTS = ((0.0, 0.7), (0.3, 1.0))  # of the window, which are fitted again
+PARTS = ((0.0, 0.7), (0.3, 1.0))  # of the window, fitted again for the error
 
 
 @dataclass(frozen=True, slots=True)
 class Oscillation:
-    """A frequency in Hz with its error, of the position at `index`, from crest to trough by `size` in SI."""
+    """An oscillation of the position at `index`: frequency in Hz with its error, peak-to-peak
+    `size` in SI.
+    """
 
     index: int
     size: float
@@ -61,12 +63,12 @@ class Oscillation:
 
 @dataclass(frozen=True, slots=True)
 class Fit:
-    """The last part of a motion.
+    """The fit of the last part of a motion.
 
-    `rate` in 1/s is that of the slowest exponential, positive if it grows, right to `error`; 0 ± inf where
-    nothing is known. `span` is the length of the window in seconds, and `ended` whether nothing moves after
-    it. `oscillation` is the largest one at the end, None if nothing oscillates. `ramp`: some
-    position moves on at a constant velocity, or at a constant acceleration.
+    `rate` in 1/s is that of the slowest exponential, positive if it grows, with the error bound `error`; 0 ±
+    inf if it is unknown. `span` is the length of the window in seconds; `ended` states that all positions are
+    constant after it. `oscillation` is the largest oscillation at the end, None without oscillation. `ramp`
+    states that some position moves at a constant velocity or acceleration.
     """
 
     rate: float
@@ -83,25 +85,27 @@ class Fit:
 
     @property
     def grows(self) -> bool:
-        """Whether it grows, its error included."""
+        """Whether the slowest exponential grows, its error included."""
         return self.rate - self.error > 0
 
     @property
     def lasts(self) -> bool:
-        """Whether an oscillation neither decays nor grows visibly in the window, its error included."""
-        crests = self.oscillation
-        if crests is None or crests.error > OPEN * crests.frequency:
+        """Whether an oscillation neither decays nor grows visibly in the window, the rate's error
+        included.
+        """
+        largest = self.oscillation
+        if largest is None or largest.error > OPEN * largest.frequency:
             return False
         return (abs(self.rate) + self.error) * self.span < OPEN and not self.decays and not self.grows
 
 
-# A channel's place, frequency and error.
+# A channel's index, frequency in Hz and error in Hz.
 _Line = tuple[int, float, float]
 
 
 @dataclass(frozen=True, slots=True)
 class _Rate:
-    """A rate in 1/s and its error, the line of the largest oscillation, and whether something drifts."""
+    """A rate in 1/s and its error, the line of the largest oscillation, and whether some position drifts."""
 
     rate: float
     error: float
@@ -111,7 +115,7 @@ class _Rate:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Poles:
-    """Poles s (k,) in 1/s, amplitudes at the end (k, channels), and the ramps over the window (channels,)."""
+    """Poles s (k,) in 1/s, amplitudes at the end (k, channels), and drifts over the window (channels,)."""
 
     s: Complexes
     amplitudes: Floats
@@ -119,16 +123,16 @@ class _Poles:
 
 
 def fit_motion(step: float, values: Floats, scale: Floats) -> Fit | None:
-    """Fit the last part of a motion; None if nothing moves in it, or the samples are too few.
+    """Return the fit of the last part of a motion; None if all positions are constant, or samples too few.
 
     Parameters
     ----------
     step
-        Seconds from row to row.
+        The sampling period in seconds.
     values
         Positions (rows, channels).
     scale
-        The range of each position (channels,) in the entire motion; what has none counts for nothing.
+        The range of each position (channels,) over the entire motion; positions of range 0 are left out.
 
     Examples
     --------
@@ -148,141 +152,165 @@ def fit_motion(step: float, values: Floats, scale: Floats) -> Fit | None:
     last = min(int(moving[-1]) + 1, len(scaled) - 1)
     ended = last < LATE * len(scaled)
     # A fast-growing motion is at rounding level, relative to its end, until shortly before it.
-    curve = np.abs(np.diff(scaled[: last + 1], 2, axis=0)).max(axis=1, initial=0.0)
-    begun = int(np.argmax(curve > FADED * curve.max(initial=0.0)))
-    first = max(min(max(last // 2, begun), last + 1 - FEWEST), 0)
+    second_differences = np.abs(np.diff(scaled[: last + 1], 2, axis=0)).max(axis=1, initial=0.0)
+    first_visible = int(np.argmax(second_differences > FADED * second_differences.max(initial=0.0)))
+    first = max(min(max(last // 2, first_visible), last + 1 - FEWEST), 0)
     window = scaled[first : last + 1]
     span = step * (len(window) - 1)
     ranges = np.ptp(window, axis=0)
-    chosen = np.argsort(-ranges, kind="stable")[:CHANNELS]
-    chosen = chosen[ranges[chosen] > VISIBLE * ranges[chosen[0]]]
-    window, indices = window[:, chosen], channels[chosen]
-    stride = _stride(window)
-    thin = window[(len(window) - 1) % stride :: stride][-MOST:]
-    result = _by_poles(step * stride, thin)
+    largest = np.argsort(-ranges, kind="stable")[:CHANNELS]
+    largest = largest[ranges[largest] > VISIBLE * ranges[largest[0]]]
+    window, indices = window[:, largest], channels[largest]
+    stride = _sample_stride(window)
+    samples = window[(len(window) - 1) % stride :: stride][-MOST:]
+    result = _rate_from_poles(step * stride, samples)
     if result is None or result.error * span > OPEN:
-        other = _by_ranges(step, window)
-        if result is None or (other is not None and other.error < result.error):
-            result = other
+        from_ranges = _rate_from_ranges(step, window)
+        if result is None or (from_ranges is not None and from_ranges.error < result.error):
+            result = from_ranges
     if result is None:
-        result = _Rate(0.0, math.inf, None, _drifts(window))
-    crests = None
+        result = _Rate(0.0, math.inf, None, _is_drifting(window))
+    oscillation = None
     if result.line is not None:
-        index, frequency, off = result.line
-        end = window[-(len(window) // 4) :, index]
-        size = float(np.ptp(_straightened(end) if result.ramp else end) * scale[indices[index]])
-        crests = Oscillation(int(indices[index]), size, frequency, off)
-    return Fit(result.rate, result.error, span, ended, crests, result.ramp)
+        index, frequency, frequency_error = result.line
+        last_quarter = window[-(len(window) // 4) :, index]
+        size = float(
+            np.ptp(_detrended(last_quarter) if result.ramp else last_quarter) * scale[indices[index]]
+        )
+        oscillation = Oscillation(int(indices[index]), size, frequency, frequency_error)
+    return Fit(result.rate, result.error, span, ended, oscillation, result.ramp)
 
 
-def _stride(window: Floats) -> int:
-    """Return the rows from sample to sample, so that the fastest visible motion is sampled well."""
+def _sample_stride(window: Floats) -> int:
+    """Return the number of rows per sample of the fit, such that the fastest visible motion is well
+    sampled.
+    """
     steps = np.diff(window, axis=0)
-    clear = np.abs(steps) > AT_REST * np.ptp(window, axis=0)
-    signs = np.sign(steps) * clear
-    turns = int((signs[1:] * signs[:-1] < 0).sum(axis=0).max(initial=0))
-    period = 2 * len(window) / turns if turns else math.inf
+    visible = np.abs(steps) > AT_REST * np.ptp(window, axis=0)
+    signs = np.sign(steps) * visible
+    reversals = int((signs[1:] * signs[:-1] < 0).sum(axis=0).max(initial=0))
+    period = 2 * len(window) / reversals if reversals else math.inf
     return int(max(1, min(len(window) // (MOST // 2), period / A_PERIOD)))
 
 
-def _by_poles(step: float, window: Floats) -> _Rate | None:
-    """Return the rate by the poles of samples (rows, channels), None if these are not found again."""
-    every = _poles(step, window)
-    if every is None:
+def _rate_from_poles(step: float, window: Floats) -> _Rate | None:
+    """Return the rate from the poles of samples (rows, channels), None if parts of the samples disagree."""
+    poles = _poles(step, window)
+    if poles is None:
         return None
     count = len(window)
     parts = [_poles(step, window[int(low * count) : int(high * count)]) for low, high in PARTS]
-    away = [np.abs(part.s[None, :] - every.s[:, None]).min(axis=1) for part in parts if part is not None]
-    if len(away) < len(parts):
+    differences = [
+        np.abs(part.s[None, :] - poles.s[:, None]).min(axis=1) for part in parts if part is not None
+    ]
+    if len(differences) < len(parts):
         return None
-    off = SAFETY * np.max(away, axis=0) + NOISE / (step * count)
-    size = every.amplitudes.max(axis=1)
+    errors = SAFETY * np.max(differences, axis=0) + NOISE / (step * count)
+    amplitudes = poles.amplitudes.max(axis=1)
     # A spurious pole is not found again in a part of the samples.
-    sure = off < np.maximum(np.abs(every.s), 1 / (step * count))
-    least = np.where(every.s.real > off, GROWING, VISIBLE) * size.max()
-    known = np.flatnonzero((size >= least) & sure)
-    if not len(known) or size[known].max() < size.max():
+    reliable = errors < np.maximum(np.abs(poles.s), 1 / (step * count))
+    least = np.where(poles.s.real > errors, GROWING, VISIBLE) * amplitudes.max()
+    visible = np.flatnonzero((amplitudes >= least) & reliable)
+    if not len(visible) or amplitudes[visible].max() < amplitudes.max():
         return None
-    slowest = known[np.argmax(every.s.real[known])]
-    # A large one that is not known to decay faster leaves the rate open.
-    large = np.flatnonzero(size > LARGE * size.max())
-    uncertainty = max(float((every.s.real[large] - every.s.real[slowest]).max()), 0.0)
-    turning = [i for i in known if abs(every.s[i].imag) > max(float(off[i]), 1 / (step * count))]
+    slowest = visible[np.argmax(poles.s.real[visible])]
+    # A large pole that is not known to decay faster adds to the error of the rate.
+    large = np.flatnonzero(amplitudes > LARGE * amplitudes.max())
+    uncertainty = max(float((poles.s.real[large] - poles.s.real[slowest]).max()), 0.0)
+    oscillating = [i for i in visible if abs(poles.s[i].imag) > max(float(errors[i]), 1 / (step * count))]
     line = None
-    if turning:
-        largest = max(turning, key=lambda i: float(size[i]))
-        frequency, error = (float(v / (2 * np.pi)) for v in (abs(every.s[largest].imag), off[largest]))
-        line = int(np.argmax(every.amplitudes[largest])), frequency, error
-    ramp = bool((every.ramps > RAMP * np.ptp(window, axis=0)).any()) and _drifts(window)
-    return _Rate(float(every.s.real[slowest]), float(off[slowest]) + uncertainty, line, ramp)
+    if oscillating:
+        largest = max(oscillating, key=lambda i: float(amplitudes[i]))
+        frequency, error = (
+            float(angular / (2 * np.pi)) for angular in (abs(poles.s[largest].imag), errors[largest])
+        )
+        line = int(np.argmax(poles.amplitudes[largest])), frequency, error
+    ramp = bool((poles.ramps > RAMP * np.ptp(window, axis=0)).any()) and _is_drifting(window)
+    return _Rate(float(poles.s.real[slowest]), float(errors[slowest]) + uncertainty, line, ramp)
 
 
 def _poles(step: float, window: Floats) -> _Poles | None:
     """Return the poles of the second differences of samples (rows, channels), None if there are none."""
-    curve = np.diff(window, 2, axis=0)
-    size, rounding = float(np.abs(curve).max(initial=0.0)), 16 * UNIT * float(np.abs(window).max())
-    if len(curve) < FEWEST // 2 or size <= rounding:
+    second_differences = np.diff(window, 2, axis=0)
+    size, rounding = (
+        float(np.abs(second_differences).max(initial=0.0)),
+        16 * UNIT * float(np.abs(window).max()),
+    )
+    if len(second_differences) < FEWEST // 2 or size <= rounding:
         return None
-    rows = min(PENCIL, len(curve) // 2)
-    blocks = [np.lib.stride_tricks.sliding_window_view(column, rows) for column in curve.T / size]
-    triangle = np.asarray(np.linalg.qr(np.concatenate(blocks), mode="r"))
-    left, singular, _ = np.linalg.svd(triangle.T)
+    rows = min(PENCIL, len(second_differences) // 2)
+    hankel_blocks = [
+        np.lib.stride_tricks.sliding_window_view(column, rows) for column in second_differences.T / size
+    ]
+    triangle = np.asarray(np.linalg.qr(np.concatenate(hankel_blocks), mode="r"))
+    left_vectors, singular, _ = np.linalg.svd(triangle.T)
     floor = max(NOISE, rounding / size)
     order = min(int((singular > floor * singular[0]).sum()), POLES, rows // 2)
-    shift = np.linalg.lstsq(left[:-1, :order], left[1:, :order], rcond=None)[0]
+    shift = np.linalg.lstsq(left_vectors[:-1, :order], left_vectors[1:, :order], rcond=None)[0]
     z = np.linalg.eigvals(shift).astype(complex)
     z = z[(np.abs(z) > NOISE) & (np.abs(z - 1) > NOISE)]
     if not len(z):
         return None
     # Columns of size 1 at their larger end; then a constant, a ramp and a parabola of the positions.
-    count = np.arange(len(window))
-    basis = z[None, :] ** (count[:, None] - np.where(np.abs(z) > 1, count[-1], 0))
-    line = count / count[-1]
-    columns = np.concatenate([basis, np.stack([line**0, line, line**2], axis=1)], axis=1)
+    sample_numbers = np.arange(len(window))
+    basis = z[None, :] ** (sample_numbers[:, None] - np.where(np.abs(z) > 1, sample_numbers[-1], 0))
+    relative_time = sample_numbers / sample_numbers[-1]
+    columns = np.concatenate(
+        [basis, np.stack([relative_time**0, relative_time, relative_time**2], axis=1)], axis=1
+    )
     weights = np.linalg.lstsq(columns, window.astype(complex), rcond=UNIT)[0]
     amplitudes = np.abs(weights[: len(z)]) * np.abs(basis[-1])[:, None]
     return _Poles(np.log(z) / step, amplitudes, np.abs(weights[-2:]).sum(axis=0))
 
 
-def _by_ranges(step: float, window: Floats) -> _Rate | None:
-    """Return the rate by the range of the largest channel by segment, None if it turns seldom."""
-    straight = _straightened(window)
-    channel = int(np.argmax(np.ptp(straight, axis=0)))
-    motion = straight[:, channel]
-    cross = np.flatnonzero(motion[1:] * motion[:-1] < 0)
-    segments = min(SEGMENTS, len(cross) // 2)
+def _rate_from_ranges(step: float, window: Floats) -> _Rate | None:
+    """Return the rate from the range of the largest channel over time, None if it has too few
+    oscillations.
+    """
+    detrended = _detrended(window)
+    channel = int(np.argmax(np.ptp(detrended, axis=0)))
+    motion = detrended[:, channel]
+    crossings = np.flatnonzero(motion[1:] * motion[:-1] < 0)
+    segments = min(SEGMENTS, len(crossings) // 2)
     if segments < FEWEST_SEGMENTS or np.ptp(motion) <= AT_REST * np.ptp(window):
         return None
     ranges = np.array([float(np.ptp(part)) for part in np.array_split(motion, segments)])
     if not (ranges > 0).all():
         return None
-    at, logs = (np.arange(segments) - (segments - 1) / 2) * step * len(motion) / segments, np.log(ranges)
-    rate = float(at @ logs / (at @ at))
-    rest = logs - logs.mean() - rate * at
-    error = SAFETY * math.sqrt(float(rest @ rest) / (segments - 2) / float(at @ at))
-    halves = np.diff(step * (cross + motion[cross] / (motion[cross] - motion[cross + 1])))
-    frequency = float(1 / (2 * halves.mean()))
-    off = SAFETY * frequency * float(halves.std() / halves.mean()) / math.sqrt(len(halves))
-    return _Rate(rate, error, (channel, frequency, off), _drifts(window))
+    times, log_ranges = (
+        (np.arange(segments) - (segments - 1) / 2) * step * len(motion) / segments,
+        np.log(ranges),
+    )
+    rate = float(times @ log_ranges / (times @ times))
+    residuals = log_ranges - log_ranges.mean() - rate * times
+    error = SAFETY * math.sqrt(float(residuals @ residuals) / (segments - 2) / float(times @ times))
+    half_periods = np.diff(
+        step * (crossings + motion[crossings] / (motion[crossings] - motion[crossings + 1]))
+    )
+    frequency = float(1 / (2 * half_periods.mean()))
+    frequency_error = (
+        SAFETY * frequency * float(half_periods.std() / half_periods.mean()) / math.sqrt(len(half_periods))
+    )
+    return _Rate(rate, error, (channel, frequency, frequency_error), _is_drifting(window))
 
 
-def _straightened(window: Floats) -> Floats:
-    """Return samples (rows, …) less the straight lines that fit them best."""
-    line = np.linspace(-1, 1, len(window))
+def _detrended(window: Floats) -> Floats:
+    """Return samples (rows, …) less their least-squares lines."""
+    times = np.linspace(-1, 1, len(window))
     rows = window.reshape(len(window), -1)
     rows = rows - rows.mean(axis=0)
-    rows = rows - line[:, None] * (line @ rows / (line @ line))
+    rows = rows - times[:, None] * (times @ rows / (times @ times))
     return np.asarray(rows.reshape(window.shape))
 
 
-def _drifts(window: Floats) -> bool:
-    """Return whether the quarter means of a channel drift in one direction by steps of like size.
+def _is_drifting(window: Floats) -> bool:
+    """Return whether the quarter means of a channel move in one direction by steps of similar size.
 
     The last step must also be a large share of the range of the last quarter: an oscillation is no drift.
     """
     quarters = np.array_split(window, 4)
     steps = np.diff([part.mean(axis=0) for part in quarters], axis=0)
-    onwards = (np.sign(steps) == np.sign(steps[0])).all(axis=0)
-    kept = np.abs(steps[2]) > KEPT_SHARE * np.abs(steps[0])
+    one_direction = (np.sign(steps) == np.sign(steps[0])).all(axis=0)
+    sustained = np.abs(steps[2]) > KEPT_SHARE * np.abs(steps[0])
     large = np.abs(steps[2]) > np.maximum(RAMP * np.ptp(window, axis=0), STEADY * np.ptp(quarters[3], axis=0))
-    return bool((onwards & kept & large).any())
+    return bool((one_direction & sustained & large).any())

@@ -1,9 +1,9 @@
-"""Until when the equations of a simulation change with time alone.
+"""The last instant at which the equations of a simulation change with time alone.
 
 Takes: a `Simulation`. Gives: `driven_until`.
-Guarantees: of equal simulations the same instant. A change that is shorter than a `GRID`-th of the duration
+Guarantees: equal simulations have the same instant. A change that is shorter than a `GRID`-th of the duration
 may be missed, unless the time at which it begins or ends is written in a continuous equation.
-Does not: find the forces that do it.
+Does not: determine the forces that change.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from apc.simulation.simulation import Simulation
 Floats = NDArray[np.float64]
 
 GRID = 1024  # instants at which equations are evaluated
-MOST_SUBSYSTEMS = 16  # different subsystems of a group that are evaluated
-STATES = (0.005, 0.01)  # between which the states are drawn, in SI
-CHANGED = 1e-12  # share of a value from which it has changed
+MOST_SUBSYSTEMS = 16  # different parameter vectors of a group that are evaluated
+STATES = (0.005, 0.01)  # range of the random states, in SI
+CHANGED = 1e-12  # relative difference above which a value counts as changed
 
 
 def driven_until(simulation: Simulation) -> float:
-    """Return the last instant in s at which an equation changes with time alone, 0 if none does."""
+    """Return the last instant in s at which an equation changes with time alone, 0 if no equation does."""
     end = float(simulation.settings.duration)
     until = 0.0
     functions: dict[PeerType, list[Any]] = {}
@@ -46,7 +46,7 @@ def driven_until(simulation: Simulation) -> float:
 
 
 def _functions(peer_type: PeerType) -> Iterator[Any]:
-    """Yield the functions of a peer type over (…, p, t)."""
+    """Yield the functions of a peer type whose last arguments are the parameters p and the time t."""
     yield peer_type.derivative
     for clock in peer_type.clocks:
         yield clock.tick
@@ -55,22 +55,32 @@ def _functions(peer_type: PeerType) -> Iterator[Any]:
 
 
 def _depends_on_time(function: Any) -> bool:
+    """Return whether some output of a function depends on its last argument, the time."""
     return any(function.jac_sparsity(out, function.n_in() - 1).nnz() for out in range(function.n_out()))
 
 
 def _last_change(function: Any, parameters: Floats, instants: Floats) -> float:
-    """Return the last of some instants at which a function differs from the one before, 0 if none does."""
-    draw, last = np.random.default_rng(0), function.n_in() - 1
-    given = [casadi.DM(draw.uniform(*STATES, function.size_in(i))) for i in range(last - 1)]
-    given += [casadi.DM(parameters), casadi.DM(instants).T]
-    inputs = [casadi.repmat(item, 1, len(instants)) for item in given[:-1]]
-    rows = [np.asarray(out, np.float64) for out in _outputs(function.map(len(instants))(*inputs, given[-1]))]
+    """Return the last instant at which a function's value differs from that at the instant before, 0
+    if none; the last of all if Newton's method solves an equation of the function.
+
+    At arbitrary states such an equation may have no solution, and CasADi prints each failure.
+    """
+    if function.find_functions(0):
+        return float(instants[-1])
+    generator, time_index = np.random.default_rng(0), function.n_in() - 1
+    arguments = [casadi.DM(generator.uniform(*STATES, function.size_in(i))) for i in range(time_index - 1)]
+    arguments += [casadi.DM(parameters), casadi.DM(instants).T]
+    inputs = [casadi.repmat(argument, 1, len(instants)) for argument in arguments[:-1]]
+    rows = [
+        np.asarray(out, np.float64) for out in _outputs(function.map(len(instants))(*inputs, arguments[-1]))
+    ]
     values = np.concatenate([row.reshape(-1, len(instants), order="F") for row in rows])
-    size = np.abs(np.nan_to_num(values)).max(axis=1, initial=0.0)[:, None]
+    magnitude = np.abs(np.nan_to_num(values)).max(axis=1, initial=0.0)[:, None]
     with np.errstate(invalid="ignore"):
-        changed = (np.abs(np.diff(values, axis=1)) > CHANGED * size).any(axis=0)
+        changed = (np.abs(np.diff(values, axis=1)) > CHANGED * magnitude).any(axis=0)
     return float(instants[1:][changed].max(initial=0.0))
 
 
 def _outputs(result: Any) -> tuple[Any, ...]:
+    """Return the outputs of a CasADi function as a tuple, also if it has a single output."""
     return result if isinstance(result, tuple) else (result,)

@@ -2,11 +2,11 @@
 
 Takes: the members of a population, their communication graph, the routes over unreliable links.
 Gives: `ExchangeProgram`, `exchange_program_of`; the operations `CompleteGraphSum`, `WeightedSum`, `Deliver`,
-`PairwiseReduction`; what they read, `PacketKey` and `Arrived`.
+`PairwiseReduction`; their sources, `PacketKey` and `Arrived`.
 Guarantees: sums and means over a complete graph cost one addition per peer, over any other graph one product
-per arc; a pairwise reduction costs one evaluation per pair. Peers that send nothing are in no mean. The
-packet in effect is that of the schedule or, on an unreliable link, of the timetable; before a packet arrives
-a receiver holds the sender's start values.
+per arc; a pairwise reduction costs one evaluation per pair. Peers that send nothing do not count in means.
+The packet in effect is that of the schedule or, on an unreliable link, of the timetable; before a packet
+arrives a receiver holds the sender's start values.
 Does not: execute them (see `interpreted_engine`, `compiled_engine`).
 
 A packet (one channel of one slot, as sent by all peers) is a row of numbers with one column per peer, member
@@ -24,11 +24,11 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from apc.compiler.weights import sum_weights
-from apc.frame.communication_graph import CommunicationGraph, check_mean
-from apc.frame.schedule import CouplingTerm, ReceivedSample, SentSample, UncertainSample
 from apc.network.packet_schedule import Route
 from apc.simulation.pairwise import Pairwise
 from apc.simulation.program import GroupProgram
+from apc.timing.communication_graph import CommunicationGraph, check_mean
+from apc.timing.schedule import CouplingTerm, ReceivedSample, SentSample, UncertainSample
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -36,7 +36,7 @@ Integers = NDArray[np.int64]
 
 @dataclass(frozen=True, slots=True)
 class PacketKey:
-    """The packet `key` as all peers sent it `lag` frames ago."""
+    """The source that is packet number `key` of all peers, sent `lag` frames ago."""
 
     key: int
     lag: int
@@ -44,7 +44,9 @@ class PacketKey:
 
 @dataclass(frozen=True, slots=True)
 class Arrived:
-    """The data in effect on a route's directed links: a channel (0 if missing) or, last, a received flag."""
+    """The source that is in effect on a route's directed links: channel `row`, or, last, the flags of
+    missing packets.
+    """
 
     route: int
     row: int
@@ -55,9 +57,10 @@ Source = PacketKey | Arrived
 
 @dataclass(frozen=True, slots=True)
 class CompleteGraphSum:
-    """A row of a member's received values: the sum of a packet over `ranges` of columns, over `divisor`.
+    """The operation that sums a packet over `ranges` of columns, divided by `divisor`, for all peers of a
+    member.
 
-    The peer's own packet is excluded if `local` is set.
+    `row` is that of the member's received values. `local`: the peer's own packet is subtracted.
     """
 
     member: int
@@ -70,7 +73,7 @@ class CompleteGraphSum:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WeightedSum:
-    """A row of a member's received values: `weights` (peers, columns of the source) times its source."""
+    """The operation `weights` (peers, columns of the source) times the source, for all peers of a member."""
 
     member: int
     row: int
@@ -80,7 +83,7 @@ class WeightedSum:
 
 @dataclass(frozen=True, slots=True)
 class Deliver:
-    """The packets that a route's tick of this frame is the first to see come in effect."""
+    """The operation that updates the values in effect on a route at one of its ticks in the frame."""
 
     route: int
     tick: int
@@ -88,12 +91,13 @@ class Deliver:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PairwiseReduction:
-    """A row of a member's received values: a function of the receiver and each sender, evaluated per arc.
+    """The operation that evaluates a function of receiver and sender per arc, and reduces it at each
+    receiver.
 
-    `function` is an index into `ExchangeProgram.functions`; `pairwise` gives its arguments from the member.
-    The received values are the columns `senders` of the `sources`, one per channel; `missing` marks missing
-    ones (None: none). The `operator` combines the values, with those of the preceding arcs unless it is the
-    `first`.
+    `row` is that of the member's received values. `function` is an index into `ExchangeProgram.functions`;
+    `pairwise` gives its arguments from the member. The received values are the columns `senders` of the
+    `sources`, one per channel; `missing` marks missing packets (None: none). The `operator` combines the
+    values, with those of the preceding arcs unless `first` is set.
     """
 
     member: int
@@ -114,13 +118,13 @@ Operation = CompleteGraphSum | WeightedSum | Deliver | PairwiseReduction
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ExchangeProgram:
-    """The packets sent and received in a frame.
+    """The packets sent and received in a frame, and the operations on them.
 
     `first` (members + 1,) are the members' first columns and the total number, `column_of` (N,) the column of
-    each peer of the model. `keys` are the packets, `sent` those of each member's rows; `ring` frames of them
-    are stored; `start` (keys, columns) are their values at time 0. For each of `routes`, `channels` are the
-    keys of each channel's slots, `held` (channels + 1, links) the values in effect at time 0. `segments` are
-    the operations before each segment of the members' programs.
+    each peer of the model. `keys` are the packets, `sent` the packets of each member's sent rows; `ring`
+    frames of packets are stored; `start` (keys, columns) are their values at time 0. For each of `routes`,
+    `channels` are the keys of each channel's slots, `held` (channels + 1, links) the values in effect at time
+    0. `segments` are the operations before each segment of the members' programs.
     """
 
     first: Integers
@@ -139,7 +143,7 @@ class ExchangeProgram:
 def exchange_program_of(
     exchange: CommunicationGraph, members: Sequence[GroupProgram], routes: Sequence[Route]
 ) -> ExchangeProgram:
-    """Build the exchange program of a frame.
+    """Return the exchange program of a frame.
 
     Parameters
     ----------
@@ -155,15 +159,15 @@ def exchange_program_of(
     ApcError
         E801 a mean over no peers, E802 a mean whose weights add up to 0.
     """
-    return _Listing(exchange, members, routes).exchange_program()
+    return _ExchangeBuilder(exchange, members, routes).exchange_program()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Arcs:
-    """The arcs (M,) to a member's peers: sender and receiver of each.
+    """The arcs (M,) to a member's peers: sender, receiver and weight of each.
 
-    `senders` are columns of packets, or directed links of an unreliable link; `receivers` are indices of
-    those peers.
+    `senders` are columns of packets, or directed links of an unreliable link; `receivers` are indices of the
+    member's peers.
     """
 
     senders: Integers
@@ -171,8 +175,8 @@ class _Arcs:
     weights: Floats
 
 
-class _Listing:
-    """Collects the operations; a common subexpression is computed once."""
+class _ExchangeBuilder:
+    """Builds the operations of all segments; common arcs and functions are built once."""
 
     def __init__(
         self, exchange: CommunicationGraph, members: Sequence[GroupProgram], routes: Sequence[Route]
@@ -199,6 +203,7 @@ class _Listing:
         self.arcs: dict[tuple[int, CouplingTerm, str], _Arcs] = {}
 
     def exchange_program(self) -> ExchangeProgram:
+        """Return the exchange program with the values at time 0."""
         start = np.zeros((len(self.keys), self.exchange.peers))
         for g, member in enumerate(self.members):
             for key, sent in enumerate(self.keys):
@@ -233,130 +238,168 @@ class _Listing:
         )  # fmt: skip
 
     def _segment(self, index: int) -> tuple[Operation, ...]:
-        """Return the operations before a segment: all its received packets were sent before its start."""
+        """Return the operations before a segment; all received packets were sent before its start."""
         operations: list[Operation] = []
-        late: dict[tuple[int, int], list[Operation]] = {}  # updated at the tick of a receiving route
-        before: dict[tuple[int, int], list[Operation]] = {}  # values of the previous tick are unchanged
+        after_delivery: dict[
+            tuple[int, int], list[Operation]
+        ] = {}  # updated at the tick of a receiving route
+        before_delivery: dict[
+            tuple[int, int], list[Operation]
+        ] = {}  # values of the previous tick are unchanged
         for g, member in enumerate(self.members):
             segment, input_rows = member.program.segments[index], member.program.schedule.all_received
             pairs = [
-                (input_rows[row], self._received(g, position, input_rows[row]))
+                (input_rows[row], self._sum_operation(g, position, input_rows[row]))
                 for position, row in enumerate(segment.received)
             ]
             for position, pairwise in enumerate(segment.pairs, len(segment.received)):
                 rows = [input_rows[row] for row in pairwise.received]
-                pairs += [(rows[0], reduction) for reduction in self._reads(g, position, pairwise, rows)]
+                pairs += [
+                    (rows[0], reduction)
+                    for reduction in self._pairwise_reductions(g, position, pairwise, rows)
+                ]
             for received, operation in pairs:
                 if isinstance(received, UncertainSample):
-                    group = before if received.coupling_term.before else late
+                    group = before_delivery if received.coupling_term.before else after_delivery
                     group.setdefault(
                         (self.route_of[received.coupling_term.link, received.clock], received.tick), []
                     ).append(operation)
                 else:
                     operations.append(operation)
-        for route, tick in sorted({*late, *before}):
-            operations += [*before.get((route, tick), ()), Deliver(route, tick), *late.get((route, tick), ())]
+        for route, tick in sorted({*after_delivery, *before_delivery}):
+            operations += [
+                *before_delivery.get((route, tick), ()),
+                Deliver(route, tick),
+                *after_delivery.get((route, tick), ()),
+            ]
         return tuple(operations)
 
     def _source(self, row: ReceivedSample | UncertainSample) -> Source:
-        """Return the source of a row of the schedule."""
+        """Return the source of a received row of the schedule."""
         if isinstance(row, ReceivedSample):
             return PacketKey(self.key_of[row.sent], row.lag)
         route = self.route_of[row.coupling_term.link, row.clock]
         channel = self.channels[route]
         return Arrived(route, len(channel) if row.gap else channel.index(row.channel))
 
-    def _received(self, listener: int, index: int, row: ReceivedSample | UncertainSample) -> Operation:
-        """Return the operations of a row that is a plain sum or mean."""
+    def _sum_operation(
+        self, member_index: int, index: int, row: ReceivedSample | UncertainSample
+    ) -> Operation:
+        """Return the operation of a received row that is a plain sum or mean."""
         coupling_term, source = row.coupling_term, self._source(row)
         if isinstance(source, Arrived) or not self.exchange.is_complete(coupling_term.link):
-            arcs = self._arcs(listener, row)
+            arcs = self._arcs(member_index, row)
             width = (
                 len(self.routes[source.route].pairs) if isinstance(source, Arrived) else self.exchange.peers
             )
-            shape = (self.members[listener].count, width)
+            shape = (self.members[member_index].count, width)
             weights = csr_array((arcs.weights, (arcs.receivers, arcs.senders)), shape=shape)
-            return WeightedSum(listener, index, source, weights)
-        sending, group = self.sending[coupling_term.link], self.members[listener].group
+            return WeightedSum(member_index, index, source, weights)
+        sending, group = self.sending[coupling_term.link], self.members[member_index].group
         senders = [
-            h
-            for h in np.flatnonzero(sending).tolist()
-            if self.exchange.delay(coupling_term.link, self.members[h].group, group) == coupling_term.delay
+            member
+            for member in np.flatnonzero(sending).tolist()
+            if self.exchange.delay(coupling_term.link, self.members[member].group, group)
+            == coupling_term.delay
         ]
         divisor = 1.0
         if coupling_term.operator == "mean":
-            divisor = float(np.diff(self.first)[sending].sum() - int(sending[listener]))
-        ranges = tuple((int(self.first[h]), int(self.first[h + 1])) for h in senders)
-        return CompleteGraphSum(listener, index, source, ranges, listener in senders, divisor)
+            divisor = float(np.diff(self.first)[sending].sum() - int(sending[member_index]))
+        ranges = tuple((int(self.first[member]), int(self.first[member + 1])) for member in senders)
+        return CompleteGraphSum(member_index, index, source, ranges, member_index in senders, divisor)
 
-    def _reads(
-        self, listener: int, index: int, pairwise: Pairwise, rows: Sequence[ReceivedSample | UncertainSample]
+    def _pairwise_reductions(
+        self,
+        member_index: int,
+        index: int,
+        pairwise: Pairwise,
+        rows: Sequence[ReceivedSample | UncertainSample],
     ) -> list[Operation]:
-        """Return the operations of a row that is a pairwise reduction, one delay after the other."""
-        function, _ = self.functions.setdefault(
+        """Return the operations that compute one pairwise reduction of a member, one operation for each
+        delay.
+
+        Parameters
+        ----------
+        member_index
+            The index of the member that receives.
+        index
+            The row of the result among the member's received values.
+        pairwise
+            The function of receiver and sender.
+        rows
+            The received rows of the schedule that it reads: for each delay those of all channels, and on an
+            unreliable link that of the missing packets.
+        """
+        function_index, _ = self.functions.setdefault(
             id(pairwise.function), (len(self.functions), pairwise.function)
         )
-        reads: list[Operation] = []
+        reductions: list[Operation] = []
         for delay in dict.fromkeys(row.coupling_term.delay for row in rows):
-            listed = [row for row in rows if row.coupling_term.delay == delay]
-            arcs = self._arcs(listener, listed[0])
-            gaps = [self._source(row) for row in listed if isinstance(row, UncertainSample) and row.gap]
-            reads.append(
+            rows_of_delay = [row for row in rows if row.coupling_term.delay == delay]
+            arcs = self._arcs(member_index, rows_of_delay[0])
+            missing_sources = [
+                self._source(row) for row in rows_of_delay if isinstance(row, UncertainSample) and row.gap
+            ]
+            reductions.append(
                 PairwiseReduction(
-                    member=listener,
+                    member=member_index,
                     row=index,
-                    function=function,
+                    function=function_index,
                     pairwise=pairwise,
-                    operator=listed[0].coupling_term.operator,
-                    first=not reads,
+                    operator=rows_of_delay[0].coupling_term.operator,
+                    first=not reductions,
                     sources=tuple(
-                        self._source(row) for row in listed if isinstance(row, ReceivedSample) or not row.gap
+                        self._source(row)
+                        for row in rows_of_delay
+                        if isinstance(row, ReceivedSample) or not row.gap
                     ),
-                    missing=next((source for source in gaps if isinstance(source, Arrived)), None),
+                    missing=next((source for source in missing_sources if isinstance(source, Arrived)), None),
                     senders=arcs.senders,
                     receivers=arcs.receivers,
                     weights=arcs.weights,
                 )
             )
-        return reads
+        return reductions
 
     # ---- communication graph
 
-    def _arcs(self, listener: int, row: ReceivedSample | UncertainSample) -> _Arcs:
-        """Return the senders of each peer of a member for a coupling term, with their weights."""
+    def _arcs(self, member_index: int, row: ReceivedSample | UncertainSample) -> _Arcs:
+        """Return the arcs of a coupling term to the peers of a member, with their weights."""
         coupling_term, clock = row.coupling_term, row.clock if isinstance(row, UncertainSample) else ""
-        key = (listener, coupling_term, clock)
+        key = (member_index, coupling_term, clock)
         if key not in self.arcs:
-            senders, receivers, weights, members = self._all_arcs(listener, coupling_term.link, clock)
+            senders, receivers, weights, members = self._all_arcs(member_index, coupling_term.link, clock)
             if coupling_term.operator != "sum":
-                totals = self._checked(listener, coupling_term, receivers, weights)
+                totals = self._checked_weight_sums(member_index, coupling_term, receivers, weights)
                 weights = weights / totals[receivers] if coupling_term.operator == "mean" else weights
-            group = self.members[listener].group
+            group = self.members[member_index].group
             delays = [self.exchange.delay(coupling_term.link, member.group, group) for member in self.members]
-            late = np.array([delay == coupling_term.delay for delay in delays])[members]
-            self.arcs[key] = _Arcs(senders[late], receivers[late], weights[late])
+            of_delay = np.array([delay == coupling_term.delay for delay in delays])[members]
+            self.arcs[key] = _Arcs(senders[of_delay], receivers[of_delay], weights[of_delay])
         return self.arcs[key]
 
-    def _all_arcs(self, listener: int, link: str, clock: str) -> tuple[Integers, Integers, Floats, Integers]:
+    def _all_arcs(
+        self, member_index: int, link: str, clock: str
+    ) -> tuple[Integers, Integers, Floats, Integers]:
         """Return senders, receivers and weights of the arcs over a link, and the senders' members.
 
         Over an unreliable link received at a `clock`, each arc is a directed link with separate packets.
         """
         if clock:
             route = self.routes[self.route_of[link, clock]]
-            arcs = np.flatnonzero(self.member_of[route.pairs[:, 1]] == listener)
+            arcs = np.flatnonzero(self.member_of[route.pairs[:, 1]] == member_index)
             pairs = route.pairs[arcs]
             return arcs, self.index_in[pairs[:, 1]], route.weights[arcs], self.member_of[pairs[:, 0]]
         if self.exchange.is_complete(link):
             peers = np.stack(
-                np.meshgrid(np.arange(self.exchange.peers), self.members[listener].peers), axis=-1
+                np.meshgrid(np.arange(self.exchange.peers), self.members[member_index].peers), axis=-1
             )
             pairs = peers.reshape(-1, 2)
             pairs = pairs[pairs[:, 0] != pairs[:, 1]]
             weights = np.ones(len(pairs))
         else:
             pairs, weights = self.exchange.arcs(link)
-        used = self.sending[link][self.member_of[pairs[:, 0]]] & (self.member_of[pairs[:, 1]] == listener)
+        used = self.sending[link][self.member_of[pairs[:, 0]]] & (self.member_of[pairs[:, 1]] == member_index)
         pairs = pairs[used]
         return (
             self.column_of[pairs[:, 0]],
@@ -365,18 +408,18 @@ class _Listing:
             self.member_of[pairs[:, 0]],
         )
 
-    def _checked(
-        self, listener: int, coupling_term: CouplingTerm, receivers: Integers, weights: Floats
+    def _checked_weight_sums(
+        self, member_index: int, coupling_term: CouplingTerm, receivers: Integers, weights: Floats
     ) -> Floats:
-        """Return the sum of the weights of each peer of a member.
+        """Return the sum of the weights at each peer of a member.
 
-        Refuses a mean, maximum or minimum over nobody, or a mean whose weights add up to 0.
+        Raises an error for a mean, maximum or minimum over no peer, or a mean whose weights add up to 0.
         """
-        member = self.members[listener]
+        member = self.members[member_index]
         receives = np.bincount(receivers, minlength=member.count) > 0
         totals = sum_weights(receivers, weights, member.count).astype(np.float64)
-        enough = receives & (totals != 0) if coupling_term.operator == "mean" else receives
-        for index in np.flatnonzero(~enough).tolist():
+        is_valid = receives & (totals != 0) if coupling_term.operator == "mean" else receives
+        for index in np.flatnonzero(~is_valid).tolist():
             peer = int(member.peers[index])
             check_mean(
                 self.exchange,
@@ -390,7 +433,7 @@ class _Listing:
 
 
 def _first_packet(member: GroupProgram, link: str, channel: str) -> Floats:
-    """Return the values sent at the start by each peer of a member (count,), 0 if none."""
+    """Return the values that each peer of a member sends at the start (count,), 0 without such a channel."""
     sent = next((send.channels for send in member.program.peer_type.sends if send.link == link), ())
     if channel not in sent:
         return np.zeros(member.count)

@@ -27,54 +27,53 @@ _PEER = re.compile(r"(?P<group>.+?)(\[(?P<number>\d+)\])?")
 
 
 def impulse_text(name: str) -> str:
-    """Return the sentence on the initial velocity of what `initial_velocity` named.
+    """Return the sentence on the initial velocity of a device named by `initial_velocity`.
 
-    >>> impulse_text("user[1].device")
-    'user[1].device starts with 100 mm/s more than in the topology.'
+    >>> impulse_text("user[1].device") 'initial velocity of user[1].device increased by 100 mm/s.'
     """
-    return f"{name} starts with {SPEED * MM:g} mm/s more than in the topology."
+    return f"initial velocity of {name} increased by {SPEED * MM:g} mm/s."
 
 
 def initial_velocity(system: Model, peer: str = "") -> tuple[Model, str]:
-    """Return the model with a peer's device moving by `SPEED` at the start, and the name of what moves.
+    """Return the model with `SPEED` added to the start velocity of one peer's device, and the device's name.
 
     Parameters
     ----------
     system
         The model.
     peer
-        Such as "user[2]"; of a group's name alone, the first of it; without a name, the first of all.
+        A peer such as "user[2]"; a group's name alone is its first peer; "" is the first peer of all.
 
     Raises
     ------
     ApcError
-        E983 no such peer, or nothing of it that a push could move.
+        E983 a peer that does not exist, or has no velocity.
     """
     names = [group.name for group in system.groups]
-    result = _PEER.fullmatch(peer.strip() or names[0])
-    number = int(result["number"] or 1) if result else 0
-    location = names.index(result["group"]) if result and result["group"] in names else -1
+    parsed = _PEER.fullmatch(peer.strip() or names[0])
+    number = int(parsed["number"] or 1) if parsed else 0
+    location = names.index(parsed["group"]) if parsed and parsed["group"] in names else -1
     if location < 0 or not 1 <= number <= system.groups[location].count:
-        message = f"there is no peer {peer.strip()[:60]} to strike"
+        message = f"unknown peer {peer.strip()[:60]}"
         raise ApcError(
             Diagnostic(
-                "E983", SourceLocation(system.name), message, hint=f'--impulse "{names[max(location, 0)]}[1]"'
+                "E983", SourceLocation(system.name), message, fix=f'--impulse "{names[max(location, 0)]}[1]"'
             )
         )
     group = system.groups[location]
     peer_type: PeerType = system.peer_types[group.peer_type]
     sent = sent_states(peer_type)
-    moving = [row for row, state in enumerate(peer_type.states) if state.unit == "m/s"]
-    local = [row for row in moving if row not in sent] or moving
-    if not local:
-        message = f"nothing of {group.name} has a velocity that a push could change"
+    velocities = [row for row, state in enumerate(peer_type.states) if state.unit == "m/s"]
+    candidates = [row for row in velocities if row not in sent] or velocities
+    if not candidates:
+        message = f"no part of {group.name} has a velocity"
         raise ApcError(Diagnostic("E983", SourceLocation(system.name), message))
-    state = peer_type.states[local[0]]
-    known = {column.name: column.values for column in group.columns}
-    present = [
+    state = peer_type.states[candidates[0]]
+    own_columns = {column.name: column.values for column in group.columns}
+    start_value = [
         parameter.value for parameter in (*system.parameters, *group.values) if parameter.name == state.start
     ][-1]
-    values = np.array(known.get(state.start, np.full(group.count, present)), dtype=np.float64)
+    values = np.array(own_columns.get(state.start, np.full(group.count, start_value)), dtype=np.float64)
     values[number - 1] += SPEED
     columns = (
         *(column for column in group.columns if column.name != state.start),

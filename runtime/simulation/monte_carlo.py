@@ -23,12 +23,19 @@ from apc.analysis.nonlinear_elements import is_linear
 from apc.compiler.compiled import LENGTH, Model
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.timings import part
-from apc.frame import numeric_model
-from apc.frame.evaluation_errors import finite_equations
+from apc.lifting.numeric_model import numeric_model
+from apc.linearization.evaluation_errors import finite_equations
 from apc.mean_square.mean_square_stability import MeanSquareVerdict, mean_square_growth, verdict_of
-from apc.memory import refuse_beyond
 from apc.network.nominal_criterion import unreliable
-from apc.processes import (
+from apc.result import Result
+from apc.simulation.driven import driven_until
+from apc.simulation.motion_classes import MotionVerdict
+from apc.simulation.output_blocks import blocks
+from apc.simulation.settings import Settings
+from apc.simulation.simulation import Simulation, prepare
+from apc.simulation.summary import BAND, SummaryAccumulator
+from apc.support.memory import refuse_beyond
+from apc.support.processes import (
     Patience,
     Workers,
     local_processes,
@@ -37,31 +44,25 @@ from apc.processes import (
     results,
     this_process,
 )
-from apc.result import Result
-from apc.simulation.driven import driven_until
-from apc.simulation.motion_classes import MotionVerdict
-from apc.simulation.output_blocks import blocks
-from apc.simulation.settings import Settings
-from apc.simulation.simulation import Simulation, prepare
-from apc.simulation.summary import BAND, SummaryAccumulator
-from apc.threads import single_threaded
+from apc.support.threads import single_threaded
 
 QUANTILES = (0.05, 0.5, 0.95)
-SURE = 1.959963984540054  # standard deviations of a normal within which 95 % lie
+SURE = 1.959963984540054  # standard deviations of the two-sided 95 % interval of a normal distribution
 # Verdicts of runs that decay, and of those that don't.
 CALM, SUSTAINED = (
     (MotionVerdict.AT_REST, MotionVerdict.DECAYS),
     (MotionVerdict.OSCILLATES, MotionVerdict.DIVERGES),
 )
-PART = 100  # runs handed to a process at a time: enough to pay for the way, few enough to share out evenly
-RUN = 300  # bytes of a run that is over
+PART = 100  # runs per task of a process: enough to outweigh the transfer, few enough for even shares
+RUN = 300  # bytes of the stored result of a run
 
 
 @dataclass(frozen=True, slots=True)
 class EnsembleRun:
-    """One run: its number, its verdict as in `summary`, and some numbers in SI, None where there is none.
+    """The result of one run: its number, its verdict as in `summary`, and values in SI.
 
-    `copy_error` is the largest distance between the peers' copies of a position at the end.
+    `settled` is the settling time, `copy_error` the largest distance between the peers' copies of a position
+    at the end. A value is None if it does not exist.
     """
 
     number: int
@@ -73,7 +74,7 @@ class EnsembleRun:
 
 @dataclass(frozen=True, slots=True)
 class Statistics:
-    """Of `count` numbers: mean with its standard error, ends, and the quantiles of `QUANTILES`."""
+    """Statistics of `count` values: mean and its standard error, smallest and largest value, `QUANTILES`."""
 
     count: int
     mean: float
@@ -85,11 +86,11 @@ class Statistics:
 
 @dataclass(frozen=True, slots=True)
 class MeanSquare:
-    """The mean-square verdict compared with the runs; `why` is the reason for a missing one.
+    """The mean-square verdict, for comparison with the runs; `why` is the reason if there is no verdict.
 
-    `stable` is None if undecided. `settles_in` is the time in seconds after which the root of a mean square
-    has fallen to the part of `summary.BAND`, None where it does not fall. `linearized` is whether it applies
-    to small motions about the start only.
+    `stable` is None if undecided. `settles_in` is the time in seconds in which the root of the mean square
+    falls to the share `summary.BAND`, None if it does not fall. `linearized` states that the verdict holds
+    for small motions about the start only.
     """
 
     verdict: MeanSquareVerdict | None
@@ -101,9 +102,9 @@ class MeanSquare:
 
 @dataclass(frozen=True, slots=True)
 class Ensemble(Result):
-    """Runs of a model, in order; `interrupted` is whether the ensemble is incomplete.
+    """The results of the runs of a model, in order; `interrupted` states that runs are missing.
 
-    `mean_square` is None where no packet is lost or late.
+    `mean_square` is None if no packet is lost or late.
     """
 
     shown_by = "simulation_output:ensemble"
@@ -122,7 +123,9 @@ class Ensemble(Result):
 
     @property
     def agrees(self) -> bool | None:
-        """Whether the runs agree with the mean-square verdict; None if that is undecided or linearized.
+        """Whether the runs agree with the mean-square verdict.
+
+        It is None if the verdict is undecided or linearized.
 
         Possible reasons for disagreement: the runs are too short, or an external force persists.
         """
@@ -139,19 +142,22 @@ class Ensemble(Result):
         return tuple(Counter(run.verdict for run in self.runs).most_common())
 
     def statistics(self, name: str) -> Statistics | None:
-        """Return statistics of the runs' values of a name, such as "settled"; None if no run has one."""
-        listed = [value for run in self.runs if (value := getattr(run, name)) is not None]
-        if not listed:
+        """Return statistics of one field of the runs, such as "settled"; None if no run has a value."""
+        present = [value for run in self.runs if (value := getattr(run, name)) is not None]
+        if not present:
             return None
-        values = np.array(listed)
+        values = np.array(present)
         n = len(values)
         error = float(values.std(ddof=1) / math.sqrt(n)) if n > 1 else math.inf
-        quantiles = tuple(float(item) for item in np.quantile(values, QUANTILES))
+        quantiles = tuple(float(quantile) for quantile in np.quantile(values, QUANTILES))
         return Statistics(n, float(values.mean()), error, float(values.min()), float(values.max()), quantiles)
 
 
 def share_interval(count: int, total: int) -> tuple[float, float]:
-    """Return the 95 % confidence interval of a share, by Wilson's score (1927, J. Am. Stat. Assoc. 22)."""
+    """Return the 95 % confidence interval of a proportion, by Wilson's score (J. Am. Stat. Assoc.
+
+    22, 1927).
+    """
     share, z2 = count / total, SURE**2
     centre = (share + z2 / (2 * total)) / (1 + z2 / total)
     half = SURE * math.sqrt(share * (1 - share) / total + z2 / (4 * total**2)) / (1 + z2 / total)
@@ -167,7 +173,7 @@ def simulate_many(
     jobs: int = 1,
     progress: Callable[[int], None] | None = None,
 ) -> Ensemble:
-    """Simulate a model several times, each time with other packet losses.
+    """Return the results of several simulations of a model, each with independent packet losses.
 
     Parameters
     ----------
@@ -185,85 +191,90 @@ def simulate_many(
     Raises
     ------
     ApcError
-        E876 too many runs to keep; E894 the model is deterministic; E895 a process ended unexpectedly; and
-        those of `simulation.prepare`.
+        E876 too many runs to store; E894 the model is deterministic; E895 a process ended unexpectedly; and
+        the errors of `simulation.prepare`.
     """
     refuse_beyond(
-        RUN * runs, "E876", SourceLocation(system.origin.topology), f"{runs:,} runs", "fewer --runs"
+        RUN * runs, "E876", SourceLocation(system.origin.topology), f"{runs:,} runs", "reduce --runs"
     )
     if not any(link.channel is not None for link in system.links):
-        message = f"nothing in {system.name} is left to chance: every run would be the same"
-        hint = f"links: {{{system.links[0].name}: {{…, loss: 2 %}}}}" if system.links else "apc simulate"
-        raise ApcError(Diagnostic("E894", SourceLocation(system.origin.topology), message, hint=hint))
+        message = f"no part of {system.name} is random: all runs are identical"
+        advice = f"write loss or jitter at link {system.links[0].name}, or " if system.links else ""
+        advice += "omit --runs"
+        raise ApcError(Diagnostic("E894", SourceLocation(system.origin.topology), message, advice=advice))
     seed = system.experiment.seed if settings.seed is None else settings.seed
     settings = replace(settings, seed=seed)
-    parts = [range(first, min(first + PART, runs)) for first in range(0, runs, PART)]
+    tasks = [range(first, min(first + PART, runs)) for first in range(0, runs, PART)]
     location = SourceLocation(system.origin.topology)
-    done: list[EnsembleRun] = []
+    finished: list[EnsembleRun] = []
     interrupted = False
     try:
-        with _workers(system, settings, min(jobs, len(parts)), location) as workers:
-            for result in results(workers, parts, Patience(), location):
-                done += result
+        with _workers(system, settings, min(jobs, len(tasks)), location) as workers:
+            for result in results(workers, tasks, Patience(), location):
+                finished += result
                 if progress is not None:
-                    progress(len(done))
+                    progress(len(finished))
     except KeyboardInterrupt:
-        if not done:
+        if not finished:
             raise
         interrupted = True
-    done.sort(key=lambda run: run.number)
+    finished.sort(key=lambda run: run.number)
     mean_square = None if interrupted else _mean_square(system)
-    return Ensemble(system.name, settings.duration, seed, tuple(done), interrupted, mean_square)
+    return Ensemble(system.name, settings.duration, seed, tuple(finished), interrupted, mean_square)
 
 
 def _mean_square(system: Model) -> MeanSquare | None:
-    """Return the verdict in mean square, None where no packet is lost or late."""
+    """Return the mean-square verdict of a model, None if no packet is lost or late."""
     if not unreliable(system):
         return None
     try:
         with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
-            prepared = numeric_model.prepare(system)
-            result = mean_square_growth(system, prepared)
+            numeric = numeric_model(system)
+            result = mean_square_growth(numeric)
     except ApcError as error:  # a model that can't be analysed can still be simulated
         return MeanSquare(None, None, None, False, error.mistakes[0].message)
-    linearized = not is_linear(system, prepared)
+    linearized = not is_linear(numeric)
     settles_in = None
     if 0 < result.radius < 1:
-        settles_in = 2 * math.log(BAND) / math.log(result.radius) * float(prepared.schedules[0].frame_s)
+        settles_in = 2 * math.log(BAND) / math.log(result.radius) * float(numeric.schedules[0].frame_s)
     return MeanSquare(verdict_of(result), result.stable, settles_in, linearized, result.why)
 
 
 def _workers(
     system: Model, settings: Settings, jobs: int, location: SourceLocation
 ) -> AbstractContextManager[Workers[range, list[EnsembleRun]]]:
-    """Return the workers: this process, or spawned ones."""
+    """Return the workers that simulate runs: this process, or separate processes."""
     if jobs == 1:
         return nullcontext(this_process(_runs, prepare(system, settings)))
-    message = "a process that played runs ended without a word: stopped from outside, or out of memory"
-    lost = Diagnostic("E895", location, message, hint="--jobs 1")
-    return local_processes(_runs_of_model, (model_bytes(system), settings), jobs, lost)
+    message = "a simulating process exited unexpectedly: stopped, or out of memory"
+    loss_error = Diagnostic("E895", location, message, fix="--jobs 1")
+    return local_processes(_runs_of_model, (model_bytes(system), settings), jobs, loss_error)
 
 
 def _runs_of_model(shared: tuple[bytes, Settings], numbers: range) -> list[EnsembleRun]:
+    """Return the results of these runs, simulated in a worker process from a serialized model."""
     return _runs(_load(*shared), numbers)
 
 
 @lru_cache(maxsize=1)
 def _load(model: bytes, settings: Settings) -> Simulation:
+    """Return the prepared simulation of a serialized model, cached in the process."""
     return prepare(model_of_bytes(model), settings)
 
 
 def _runs(simulation: Simulation, numbers: range) -> list[EnsembleRun]:
-    """Simulate some runs."""
-    player, runs = simulation.player(), []
-    lengths = {signal.local for signal in simulation.signals if signal.unit == LENGTH}
+    """Return the results of the runs with these numbers."""
+    engine, runs = simulation.player(), []
+    length_names = {signal.local for signal in simulation.signals if signal.unit == LENGTH}
     until = driven_until(simulation)
-    for number in numbers:
-        watch = SummaryAccumulator(simulation, until)
-        for block in blocks(simulation, run=number, player=player):
-            watch.take(block.time, block.values)
-        summary = watch.summary(block)
+    for run_number in numbers:
+        accumulator = SummaryAccumulator(simulation, until)
+        for block in blocks(simulation, run=run_number, player=engine):
+            accumulator.take(block.time, block.values)
+        summary = accumulator.summary(block)
         force = None if summary.largest_force is None else summary.largest_force[1]
-        copies = max((distance for name, distance in summary.copies if name in lengths), default=None)
-        runs.append(EnsembleRun(number, summary.verdict, summary.settled, force, copies))
+        copy_error = max(
+            (distance for name, distance in summary.copies if name in length_names), default=None
+        )
+        runs.append(EnsembleRun(run_number, summary.verdict, summary.settled, force, copy_error))
     return runs

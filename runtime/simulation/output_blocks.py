@@ -2,8 +2,8 @@
 
 Takes: a `Simulation`. Gives: `OutputBlock`, `blocks`; `instants_of`, `forces_in_time`, `unsolved`.
 Guarantees: a row for time 0 and for every tick of the fastest clock until the end, values before the tick;
-the memory used does not grow with the duration; no number that is not finite is given out.
-Does not: keep, write or judge what comes out (see `trajectory`, `recording`, `summary`).
+the memory used does not grow with the duration; every returned number is finite.
+Does not: store, write or evaluate the rows (see `trajectory`, `recording`, `summary`).
 """
 
 from __future__ import annotations
@@ -27,12 +27,11 @@ MOST_NAMED = 6  # states in a message
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OutputBlock:
-    """Some rows: `time` (rows,) in seconds, `values` (rows, signals) in SI.
+    """A block of rows: `time` (rows,) in seconds, `values` (rows, signals) in SI.
 
-    `work` (parts,) is what the parts have done until the last frame that begins by then, over all peers, in
-    J.
-    `stopped` is the name of what left the range of floats after the last row, at `stopped_at` seconds; empty
-    if nothing did.
+    `work` (parts,) is the work in J of each part over all peers, up to the last frame that begins within the
+    block. `stopped` is the name of the signal that left the range of floats after the last row, at
+    `stopped_at` seconds; "" if all are finite.
     """
 
     time: Floats
@@ -45,7 +44,7 @@ class OutputBlock:
 def blocks(
     simulation: Simulation, *, run: int = 0, player: FrameEngine | None = None
 ) -> Iterator[OutputBlock]:
-    """Simulate a model from time 0 and yield its rows, block by block.
+    """Yield the rows of a simulation from time 0, block by block.
 
     Parameters
     ----------
@@ -54,13 +53,13 @@ def blocks(
     run
         The index among runs of one seed: each has separate losses.
     player
-        One of the simulation's, which is used no more; a new one if not given.
+        An engine of this simulation that is not used otherwise; by default a new engine.
 
     Raises
     ------
     ApcError
-        E872 an equation has no solution at some instant, E871 a motion can't be integrated any further; what
-        was before is yielded first.
+        E872 an equation has no solution at some instant, E871 a motion cannot be integrated any further; the
+        rows before are yielded first.
     """
     last = int(simulation.settings.duration / simulation.quantum)  # rounds down
     player, length, sample_times = (
@@ -68,26 +67,26 @@ def blocks(
         simulation.length,
         len(simulation.sample_times),
     )
-    done, stopped, stopped_at = np.zeros(len(simulation.population.parts)), "", 0.0
+    work_until_now, stopped, stopped_at = np.zeros(len(simulation.population.parts)), "", 0.0
     player.begin(run)
     for first in range(0, last // simulation.frame + 1, length):
         simulated = player.advance(first, length, forces_in_time(simulation, first))
-        instants, stored = instants_of(simulation, first, length, last)
-        stored &= np.arange(len(stored)) < simulated.frames * sample_times
-        values = simulated.rows[stored][:, simulation.order]
-        time = instants[stored] * simulation.quantum.numerator / simulation.quantum.denominator
+        instants, is_row = instants_of(simulation, first, length, last)
+        is_row &= np.arange(len(is_row)) < simulated.frames * sample_times
+        values = simulated.rows[is_row][:, simulation.order]
+        time = instants[is_row] * simulation.quantum.numerator / simulation.quantum.denominator
         finite = np.isfinite(values)
         stop = int(np.argmin(np.append(finite.all(axis=1), False)))  # the first row that is not finite
         if stop:  # to the last frame that begins by the last row
-            work = simulated.work[int(np.flatnonzero(stored)[stop - 1]) // sample_times]
+            work = simulated.work[int(np.flatnonzero(is_row)[stop - 1]) // sample_times]
             if np.isfinite(work).all():  # a product of forces and speeds overflows long before they do
-                done = work.copy()
+                work_until_now = work.copy()
         if stop < len(time):
             name = simulation.signals[int(np.argmin(finite[stop]))].name
             stopped, stopped_at = name, float(time[stop])
         elif simulated.frames == length and instants[-1] <= last and not player.in_range():
-            stopped, stopped_at = "what is not recorded", float(time[-1])
-        yield OutputBlock(time[:stop], values[:stop], done, stopped, stopped_at)
+            stopped, stopped_at = "a state that is not recorded", float(time[-1])
+        yield OutputBlock(time[:stop], values[:stop], work_until_now, stopped, stopped_at)
         if stopped:
             return
         if simulated.frames < length:
@@ -95,49 +94,54 @@ def blocks(
 
 
 def unsolved(simulation: Simulation, frame: int) -> ApcError:
-    """Return the error of a frame that could not be simulated."""
+    """Return the error E871 or E872 of a frame that could not be simulated."""
     location = SourceLocation(simulation.system.origin.topology)
     at = f"after {float(frame * simulation.frame * simulation.quantum):g} s"
     if not simulation.tolerances:
-        message = f"an equation has no solution, or a loop none that Newton's method finds, {at}"
+        message = f"an equation has no solution, or Newton's method finds none, {at}"
         return ApcError(Diagnostic("E872", location, message))
     states = ", ".join(tolerance.state for tolerance in simulation.tolerances[:MOST_NAMED])
     message = (
-        f"the motion of {states} can't be integrated {at}: it grows without measure, an equation there has "
-        "no value, or a force jumps to and fro without end"
+        f"the motion of {states} can't be integrated {at}: it diverges, an equation has "
+        "no value, or a force is discontinuous"
     )
-    hint = "dry friction by tanh in the place of sign; --method semi-implicit:0.1ms shows what happens"
-    return ApcError(Diagnostic("E871", location, message, hint=hint))
+    advice = "model dry friction by tanh instead of sign, or use --method semi-implicit:0.1ms"
+    return ApcError(Diagnostic("E871", location, message, advice=advice))
 
 
 def forces_in_time(simulation: Simulation, first: int) -> list[Floats | None]:
-    """Return the impulses of frames from `first` on, of each member (frames, rows, subsystems), if any."""
+    """Return the impulses of a chunk from frame `first` on: (frames, rows, subsystems) for each member.
+
+    A member without time-varying forces has None.
+    """
     result: list[Floats | None] = []
-    numbers = first + np.arange(simulation.length)
+    frames = first + np.arange(simulation.length)
     for member, forces in zip(simulation.population.members, simulation.forces, strict=True):
         if not forces:
             result.append(None)
             continue
         program = member.program
-        begin = np.array([at for at, _ in program.intervals], dtype=np.int64)
-        which = np.tile(np.array([index for _, index in program.intervals], dtype=np.int64), len(numbers))
-        quanta = (numbers[:, None] * simulation.frame + begin).reshape(-1)
+        offsets = np.array([start for start, _ in program.intervals], dtype=np.int64)
+        lengths = np.tile(np.array([index for _, index in program.intervals], dtype=np.int64), len(frames))
+        quanta = (frames[:, None] * simulation.frame + offsets).reshape(-1)
         starts = quanta * simulation.quantum.numerator / simulation.quantum.denominator
-        local = [
-            impulses(force, starts, which)[:, program.rates.forced].reshape(len(numbers), -1)
+        of_subsystems = [
+            impulses(force, starts, lengths)[:, program.rates.forced].reshape(len(frames), -1)
             for force in forces
         ]
-        result.append(np.ascontiguousarray(np.stack(local, axis=-1)))
+        result.append(np.ascontiguousarray(np.stack(of_subsystems, axis=-1)))
     return result
 
 
 def instants_of(
     simulation: Simulation, first: int, count: int, last: int
 ) -> tuple[Integers, NDArray[np.bool_]]:
-    """Return the instant in quanta of each row of some frames, and which are kept: those until `last`."""
+    """Return the instant in quanta of each row of some frames, and which rows are output: those until
+    `last`.
+    """
     sample_times = np.array(simulation.sample_times, dtype=np.int64)
     instants = (first + np.arange(count))[:, None] * simulation.frame + sample_times
-    stored = ((sample_times > sample_times[0]) | simulation.ticks_at_zero | (instants == 0)) & (
+    is_row = ((sample_times > sample_times[0]) | simulation.ticks_at_zero | (instants == 0)) & (
         instants <= last
     )
-    return instants.reshape(-1), stored.reshape(-1)
+    return instants.reshape(-1), is_row.reshape(-1)

@@ -21,21 +21,22 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
-from apc.frame.communication_graph import CommunicationGraph
-from apc.frame.schedule import Propagate, Schedule, Tick
 from apc.network.packet_schedule import START, DeliveredPackets, Route
 from apc.simulation.exchange_program import ExchangeProgram, exchange_program_of
 from apc.simulation.program import GroupProgram, timed_events
+from apc.timing.communication_graph import CommunicationGraph
+from apc.timing.schedule import Propagate, Schedule, Tick
 
 Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Population:
-    """All peers. A frame has a length in quanta, and rows at `sample_count`, each of `width` numbers.
+    """All peers of a simulation, with the lengths of a frame and of its recorded rows.
 
-    A row holds, member by member from `columns` on, each signal of all its peers. `parts` are the parts whose
-    work is summed.
+    `frame` is the length in quanta; a frame has `sample_count` rows of `width` numbers. A row contains,
+    member by member, each recorded signal of all the member's peers; `columns` are the members' first
+    columns. `parts` are the parts whose work is summed.
     """
 
     members: tuple[GroupProgram, ...]
@@ -50,9 +51,10 @@ class Population:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameRows:
-    """Some frames: `rows` (frames · marks, width), `work` (frames, parts) in J until each begins.
+    """The results of some frames: `rows` (frames · samples, width), `work` (frames, parts) in J until
+    each frame.
 
-    Only the first `frames` could be simulated.
+    Only the first `frames` frames could be simulated.
     """
 
     rows: Floats
@@ -61,37 +63,50 @@ class FrameRows:
 
 
 class DeliverySource(Protocol):
-    """A source of the packets in effect at each route's ticks, such as `Timetable`; time only advances."""
+    """A source of the packets in effect at each route's ticks, such as `Timetable`.
+
+    Requests advance in time.
+    """
 
     def take(self, until: int) -> tuple[DeliveredPackets, ...]:
-        """Return the packets in effect at each route's ticks, from the last call until `until` in quanta."""
+        """Return the packets in effect at each route's ticks, from the last request until `until` in
+        quanta.
+        """
 
 
 class FrameEngine(Protocol):
-    """Simulates a population, frame after frame; the runs of one seed differ in their packets."""
+    """The protocol of an engine that simulates a population frame by frame.
+
+    Runs of one seed differ in packets.
+    """
 
     def begin(self, run: int) -> None:
-        """Go back to time 0 of the run of a number."""
+        """Reset all peers to time 0, with the packets of this run."""
 
     def advance(self, first: int, count: int, pushes: Sequence[Floats | None]) -> FrameRows:
-        """Simulate the frames from number `first` on; `pushes` are the impulses on members.
+        """Return the rows of `count` frames from number `first` on, simulated under these impulses.
 
-        They are (frames, rows, subsystems). What is returned may be written over by the next call.
+        `pushes` are (frames, rows, subsystems) for each member, None without forces. The next call may
+        overwrite the returned arrays.
         """
 
     def in_range(self) -> bool:
-        """Return whether all states, recorded or not, are finite; the work may not be."""
+        """Return whether all states are finite, recorded or not; the work may not be finite."""
 
 
 class PopulationState:
     """The stored values of all peers from frame to frame, in arrays with fixed addresses.
 
-    `packets` (ring, keys, peers) are those of the last frames; `carries` are of each member (rows, peers);
-    `held` and `effective` are of each route, as of `ExchangeProgram`, and the number of the packet in effect.
+    `packets` (ring, keys, peers) are those of the last frames; `carries` are those of each member (rows,
+    peers). For each route, `held` are the values in effect, and `effective` the numbers of the packets in
+    effect.
     """
 
     def __init__(self, population: Population, timetable: Callable[[int], DeliverySource] | None) -> None:
-        """Make it, at time 0 of the first run; `timetable` gives the packets of a run, None without any."""
+        """Set up the arrays at time 0 of the first run.
+
+        `timetable` gives the packets of a run, None without any.
+        """
         exchange_program, self.population, self.timetable = population.exchange_program, population, timetable
         self.packets = np.empty((exchange_program.ring, *exchange_program.start.shape))
         self.carries = [np.empty((member.carry.shape[1], member.count)) for member in population.members]
@@ -100,14 +115,14 @@ class PopulationState:
         self.begin(0)
 
     def begin(self, run: int) -> None:
-        """Go back to time 0 (see `FrameEngine`)."""
+        """Reset all arrays to time 0 of a run (see `FrameEngine`)."""
         exchange_program, members = self.population.exchange_program, self.population.members
         self.table = None if self.timetable is None else self.timetable(run)
         self.packets[:] = exchange_program.start
         for array, start in zip(self.held, exchange_program.held, strict=True):
             array[:] = start
-        for numbers in self.effective:
-            numbers[:] = START
+        for packet_numbers in self.effective:
+            packet_numbers[:] = START
         for carry, member in zip(self.carries, members, strict=True):
             carry[:] = member.each(member.carry).T
 
@@ -118,66 +133,66 @@ class PopulationState:
     def in_range(self) -> bool:
         """Return whether all states are finite (see `FrameEngine`)."""
         members = zip(self.carries, self.population.members, strict=True)
-        moving = (carry[: member.program.layout.work.start] for carry, member in members)
-        return all(bool(np.isfinite(array).all()) for array in (self.packets, *moving))
+        state_rows = (carry[: member.program.layout.work.start] for carry, member in members)
+        return all(bool(np.isfinite(array).all()) for array in (self.packets, *state_rows))
 
 
 def exchanges_within(schedules: Sequence[Schedule]) -> tuple[int, ...]:
-    """Return the instants, in quanta, of exchanges within the frame.
+    """Return the instants, in quanta, at which packets are exchanged within the frame.
 
-    At these a packet is sent and received within the frame, or a tick has a pairwise reduction.
+    A packet is sent and received within the frame at these instants, or a tick has a pairwise reduction.
     """
     slots = {received.sent for schedule in schedules for received in schedule.received if received.lag == 0}
     # Over an unreliable link a packet may be received as soon as it is sent.
     any_time = {selected.coupling_term.link for schedule in schedules for selected in schedule.selected}
-    numbers = {
-        at
+    instants = {
+        instant
         for schedule in schedules
-        for sent, at in zip(schedule.sent, schedule.sent_times, strict=True)
+        for sent, instant in zip(schedule.sent, schedule.sent_times, strict=True)
         if sent in slots or sent.link in any_time
     }
     for schedule in schedules:
         for now, event in timed_events(schedule):
             received = (row for rows in event.input_rows for row in rows) if isinstance(event, Tick) else ()
             if any(schedule.all_received[row].coupling_term.edge for row in received):
-                numbers.add(now)
-    return tuple(sorted(numbers))
+                instants.add(now)
+    return tuple(sorted(instants))
 
 
 def instants_within(schedules: Sequence[Schedule]) -> tuple[int, ...]:
-    """Return the instants, in quanta, at which anything is computed or sent within the frame."""
-    numbers = {
+    """Return the instants, in quanta, of computations and sends within the frame."""
+    instants = {
         now
         for schedule in schedules
         for now, event in timed_events(schedule)
         if not isinstance(event, Propagate)
     }
-    return tuple(sorted(numbers))
+    return tuple(sorted(instants))
 
 
 def refuse_unheard_of(system: Model) -> None:
-    """Refuse a peer without an own value as the substitute for a lost packet."""
+    """Raise E893 if a link replaces lost packets by zero and a receiving peer has no own value to send."""
     zero = {link.name for link in system.links if link.channel and link.channel.on_loss == "zero"}
     for peer_type in system.peer_types:
         for partition in peer_type.clocks:
             for receive in partition.receives:
                 if receive.link in zero and not any(send.link == receive.link for send in peer_type.sends):
                     message = (
-                        f"{receive.name} hears {receive.link}, over which its peer sends nothing: it has no "
-                        "value of its own to stand in for a missing one"
+                        f"{receive.name} has no value to substitute for a lost packet, because its peer does "
+                        f"not send over {receive.link}"
                     )
                     raise ApcError(
                         Diagnostic(
-                            "E893", SourceLocation(system.origin.topology), message, hint="on_loss: hold"
+                            "E893", SourceLocation(system.origin.topology), message, fix="on_loss: hold"
                         )
                     )
                 if receive.link in zero and receive.before:
                     message = (
-                        f"{receive.name}: what stood in for a missing value at the tick before is not kept"
+                        f"{receive.name}: the substitute for a lost packet of the previous tick is not stored"
                     )
                     raise ApcError(
                         Diagnostic(
-                            "E893", SourceLocation(system.origin.topology), message, hint="on_loss: hold"
+                            "E893", SourceLocation(system.origin.topology), message, fix="on_loss: hold"
                         )
                     )
 
@@ -185,7 +200,7 @@ def refuse_unheard_of(system: Model) -> None:
 def build_population(
     exchange: CommunicationGraph, members: Sequence[GroupProgram], routes: Sequence[Route] = ()
 ) -> Population:
-    """Join the programs of all groups by the packets between them.
+    """Return the population of all members, with their programs joined by the packets between them.
 
     Parameters
     ----------

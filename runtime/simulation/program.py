@@ -1,15 +1,16 @@
-"""One frame of one site as compiled steps, and the peers that execute them.
+"""The program of one frame of a subsystem, and the peers that execute it.
 
-Takes: sites' parameters, the maps of each interval, start values; the site of each peer of a group.
+Takes: parameter vectors, the transitions over each interval, start values; the subsystem of each peer of a
+group.
 Gives: `Program`, `Segment`, `Layout`; `GroupProgram`, `build_member`; `timed_events`, `seconds_at`.
 Guarantees: the carry at time 0 has start states, and zeros for values not yet computed. Data common to
 several peers is stored once.
-Does not: write the steps (see `program_builder`), or handle other members (see `exchange_program`,
+Does not: build the functions (see `program_builder`), or handle other members (see `exchange_program`,
 `population`).
 
 A segment lies between two instants of packet exchange or pairwise reduction within the frame:
 
-    (carry, heard, constants, impulses, frame) -> (carry⁺, sent, rows)
+    (carry, received, constants, impulses, frame) -> (carry⁺, sent, rows)
 """
 
 from __future__ import annotations
@@ -24,23 +25,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import PeerType
-from apc.frame.jacobians import SubsystemJacobians
-from apc.frame.linearize import start_values
-from apc.frame.schedule import ClockedValue, Event, Propagate, Schedule
+from apc.linearization.jacobians import SubsystemJacobians
+from apc.linearization.linearize import start_values
 from apc.simulation.pairwise import Pairwise
 from apc.simulation.propagate import Rates
 from apc.simulation.signals import LocalSignal
+from apc.timing.schedule import ClockedValue, Event, Propagate, Schedule
 
 Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """The rows of the carry: x, newest outputs, outputs of holds, values to act later, work.
+    """The rows of the carry: x, newest outputs, outputs of holds, values for later use, work.
 
-    `outputs` are the (clock partition, output) pairs that are remembered or recorded; `later_values` are
-    values of earlier frames, or of earlier segments, that a hold puts out after; `parts` are those whose work
-    is added up.
+    `outputs` are the (clock partition, output) pairs that are memories or recorded; `later_values` are values
+    of earlier frames or segments that a hold outputs later; `parts` are the parts whose work is added up.
     """
 
     states: int
@@ -51,7 +51,7 @@ class Layout:
 
     @property
     def ends(self) -> tuple[int, ...]:
-        """The first index of each part, and the end of the last."""
+        """The first row of each part of the carry, and the end of the last part."""
         sizes = (self.states, len(self.outputs), self.holds, len(self.later_values), len(self.parts))
         return tuple(accumulate(sizes, initial=0))
 
@@ -68,10 +68,10 @@ class Layout:
 
 @dataclass(frozen=True, slots=True)
 class Segment:
-    """A stretch of the frame: `kernel` is the function above; `received`, `sent` are rows of the schedule.
+    """A segment of the frame: `kernel` is the function above; `received`, `sent` are rows of the schedule.
 
-    After those rows the kernel hears what comes of each of `pairwise`. Of a frame's rows and impulses its
-    first are `first_mark` and `first_impulse`.
+    The received values are followed by the results of the `pairs`. `first_mark` and `first_impulse` are the
+    first of the frame's recorded rows and impulses that belong to the segment.
     """
 
     kernel: Any  # casadi.Function
@@ -84,11 +84,11 @@ class Segment:
 
 @dataclass(frozen=True, slots=True)
 class Program:
-    """A subsystem's frame. `recorded` are the signals of each row; `timed`: it depends on the frame number.
+    """The program of a subsystem's frame; `recorded` are the signals of each row.
 
     `durations` are the intervals' lengths in quanta, in the order of a subsystem's constants; `intervals` are
-    (start, place in `durations`) of each interval, for the impulses of forces that change with time; `moves`
-    are the integrators of the segments, kept alive with them.
+    (start, index in `durations`) of each interval, for the impulses of time-varying forces; `moves` are the
+    integrators, referenced here as long as the segments call them.
     """
 
     peer_type: PeerType
@@ -103,7 +103,7 @@ class Program:
 
     @property
     def seconds(self) -> tuple[Fraction, ...]:
-        """The intervals' lengths in seconds."""
+        """The lengths of the intervals in seconds."""
         return tuple(length * self.schedule.quantum for length in self.durations)
 
     @property
@@ -112,7 +112,9 @@ class Program:
         return len(self.rates.forced) * len(self.intervals) if self.rates.timed else 0
 
     def constants(self, parameters: Floats, transitions: Sequence[Floats]) -> Floats:
-        """Return constants (subsystems, rows): parameters, then [E F c] of each duration, columns first."""
+        """Return the constants (subsystems, rows): parameters, then [E F c] of each duration, column by
+        column.
+        """
         columns = self.rates.pattern.T
         return np.concatenate(
             [parameters, *(transition.swapaxes(1, 2)[:, columns] for transition in transitions)], axis=1
@@ -126,18 +128,18 @@ def timed_events(schedule: Schedule) -> list[tuple[int, Event]]:
 
 
 def seconds_at(schedule: Schedule, frame: Any, now: int) -> Any:
-    """Return the time of an instant of a frame, rounded once: counted in quanta, which are whole numbers."""
+    """Return the time in s of an instant of a frame, counted in integer quanta and rounded once."""
     quanta = frame * schedule.frame + now
     return quanta * schedule.quantum.numerator / schedule.quantum.denominator
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GroupProgram:
-    """Peers of one group of the model in a population.
+    """A member of a population: peers of one group of the model, with their program.
 
-    `peers` (count,) are their numbers in the model. `rows` (count,) is the subsystem index of each;
-    `parameters` (subsystems, n_p) are those subsystems' vectors, `constants` (subsystems, rows) their program
-    constants; `sends` are the values sent at the start (subsystems, channels), by link.
+    `peers` (count,) are their indices in the model. `rows` (count,) is the subsystem index of each peer;
+    `parameters` (subsystems, n_p) are the parameter vectors of the subsystems, `constants` (subsystems, rows)
+    their program constants; `sends` are the values sent at the start (subsystems, channels), by link.
     """
 
     group: int
@@ -168,42 +170,44 @@ def build_member(
     program: Program,
     transitions: Sequence[Floats],
 ) -> GroupProgram:
-    """Collect the contributions of some peers of a group to a population.
+    """Return a member of a population: some peers of a group, with their program and start values.
 
     Parameters
     ----------
     group
-        The group's place in the model.
+        The group's index in the model.
     peers
-        The peers' numbers in the model (count,).
+        The peers' indices in the model (count,).
     subsystem
-        The group's peer type.
+        The Jacobians of the group's peer type.
     rows, vectors, transitions
-        Which of the group's different subsystems each peer is (count,), their parameters (subsystems, n_p),
-        and what they do over the program's intervals.
+        The index of each peer among the group's different subsystems (count,), the parameters of these
+        (subsystems, n_p), and their transitions over the program's intervals.
     program
         The frame program of each peer.
     """
-    used, local = np.unique(rows, return_inverse=True)
-    vector, peer_type, layout = vectors[used], subsystem.peer_type, program.layout
-    x, _, stored = start_values(subsystem, list(vector.T))
-    carry = np.zeros((len(vector), layout.ends[-1]))
+    used, subsystem_of_peer = np.unique(rows, return_inverse=True)
+    used_vectors, peer_type, layout = vectors[used], subsystem.peer_type, program.layout
+    x, _, memories = start_values(subsystem, list(used_vectors.T))
+    carry = np.zeros((len(used_vectors), layout.ends[-1]))
     for row, value in enumerate(x):
         carry[:, row] = value
-    for p, (partition, values) in enumerate(zip(peer_type.clocks, stored, strict=True)):
+    for p, (partition, values) in enumerate(zip(peer_type.clocks, memories, strict=True)):
         for output, value in zip(partition.memories, values, strict=True):
-            if (p, output) in layout.outputs:  # else its clock never ticks
+            if (p, output) in layout.outputs:  # otherwise its clock never ticks
                 carry[:, layout.states + layout.outputs.index((p, output))] = value
-    states, still = carry[:, : layout.states].T, np.zeros((layout.holds, len(vector)))
+    states, zero_holds = carry[:, : layout.states].T, np.zeros((layout.holds, len(used_vectors)))
     return GroupProgram(
         group=group,
         peers=peers,
         program=program,
-        rows=local,
-        parameters=vector,
-        constants=program.constants(vector, [transition[used] for transition in transitions]),
+        rows=subsystem_of_peer,
+        parameters=used_vectors,
+        constants=program.constants(used_vectors, [transition[used] for transition in transitions]),
         sends={
-            send.link: np.asarray(send.send.map(len(vector))(states, still, vector.T, 0.0), np.float64).T
+            send.link: np.asarray(
+                send.send.map(len(used_vectors))(states, zero_holds, used_vectors.T, 0.0), np.float64
+            ).T
             for send in peer_type.sends
         },
         carry=carry,

@@ -16,8 +16,13 @@ import casadi
 import numpy as np
 
 from apc.compiler.compiled import PeerType
-from apc.frame.jacobians import edge_name
-from apc.frame.schedule import (
+from apc.linearization.jacobians import edge_name
+from apc.simulation.flow import Flow
+from apc.simulation.pairwise import Pairwise, pair_function
+from apc.simulation.program import Layout, Program, Segment, seconds_at, timed_events
+from apc.simulation.propagate import Rates
+from apc.simulation.signals import LocalSignal, ticking_partitions
+from apc.timing.schedule import (
     ClockedValue,
     Event,
     HoldUpdate,
@@ -29,11 +34,6 @@ from apc.frame.schedule import (
     discrete_states_of,
     shifted,
 )
-from apc.simulation.flow import Flow
-from apc.simulation.pairwise import Pairwise, pair_function
-from apc.simulation.program import Layout, Program, Segment, seconds_at, timed_events
-from apc.simulation.propagate import Rates
-from apc.simulation.signals import LocalSignal, ticking_partitions
 
 Timed = Sequence[tuple[int, Event]]  # events, each with its instant in quanta
 
@@ -45,7 +45,7 @@ def build_program(
     cuts: Sequence[int],
     flow: Flow | None = None,
 ) -> Program:
-    """Write a subsystem's frame.
+    """Return the frame program of a subsystem: one compiled function per segment of the frame.
 
     Parameters
     ----------
@@ -54,14 +54,14 @@ def build_program(
     schedule
         The schedule of a frame.
     recorded
-        The signals to record at every mark of the schedule.
+        The signals to record at every sample time of the schedule.
     cuts
-        The instants, in quanta, after whose sends packets are exchanged within the frame, and those at which
-        peers look at each other pair by pair.
+        The ends of segments in quanta: instants at which packets are exchanged within the frame, and
+        instants of pairwise reductions.
     flow
         The integrator of the states without exact transition.
     """
-    segments = _cut(timed_events(schedule), cuts)
+    segments = _split_events(timed_events(schedule), cuts)
     writer = _SegmentWriter(rates, schedule, recorded, flow, segments)
     return Program(
         peer_type=rates.peer_type,
@@ -76,9 +76,9 @@ def build_program(
     )
 
 
-def _cut(events: Timed, cuts: Sequence[int]) -> list[Timed]:
-    """Return the events of each segment."""
-    # Sends come first of what happens at an instant, whatever the group.
+def _split_events(events: Timed, cuts: Sequence[int]) -> list[Timed]:
+    """Return the events of each segment of the frame."""
+    # The sends of an instant precede its other events in every group.
     ends = [
         sum(now < cut or (now == cut and isinstance(event, SendEvent)) for now, event in events)
         for cut in sorted(cuts)
@@ -89,18 +89,18 @@ def _cut(events: Timed, cuts: Sequence[int]) -> list[Timed]:
 def _layout(
     peer_type: PeerType, schedule: Schedule, segments: Sequence[Timed], recorded: Sequence[LocalSignal]
 ) -> Layout:
-    """Return the rows of the carry; it is the same between any two segments."""
-    observed = {signal.index for signal in recorded if signal.role == "output"}
-    before = discrete_states_of(
+    """Return the rows of the carry, the stored values between segments; all segments have the same rows."""
+    recorded_outputs = {signal.index for signal in recorded if signal.role == "output"}
+    from_earlier_frame = discrete_states_of(
         [event.value for event in schedule.events if isinstance(event, HoldUpdate)], schedule.ticks
     )
-    passed = set(before)  # and what is computed in another segment than it is needed in
+    stored_values = set(from_earlier_frame)  # and values that are computed in one segment and used in another
     for events in segments:
         needed = {event.value for _, event in events if isinstance(event, HoldUpdate)}
         if events is segments[-1]:
-            needed |= {shifted(value, schedule.ticks) for value in before}
+            needed |= {shifted(value, schedule.ticks) for value in from_earlier_frame}
         computed = {(event.partition, event.index) for _, event in events if isinstance(event, Tick)}
-        passed |= {
+        stored_values |= {
             value for value in needed if value.index >= 0 and (value.partition, value.index) not in computed
         }
     return Layout(
@@ -109,16 +109,16 @@ def _layout(
             (p, o)
             for p in ticking_partitions(schedule)
             for o in range(len(peer_type.clocks[p].outputs))
-            if o in peer_type.clocks[p].memories or (p, o) in observed
+            if o in peer_type.clocks[p].memories or (p, o) in recorded_outputs
         ),
         holds=len(peer_type.holds),
-        later_values=tuple(sorted(passed)),
+        later_values=tuple(sorted(stored_values)),
         parts=tuple(dict.fromkeys(peer_type.ports.parts)) if peer_type.ports else (),
     )
 
 
 class _SegmentWriter:
-    """Writes one segment after the other; the carry at the end of one is the input of the next."""
+    """Builds the functions of the segments in order; the carry at the end of one is the input of the next."""
 
     def __init__(
         self,
@@ -143,11 +143,11 @@ class _SegmentWriter:
         self.type_: Any = casadi.SX if plain else casadi.MX
         self.intervals: list[tuple[int, int]] = []
         self.layout = _layout(peer_type, schedule, segments, recorded)
-        self.begun = -1  # the instant of the event before
+        self.begun = -1  # the instant of the previous event
         self.sample_times = self.impulses = 0  # written so far
 
     def segment(self, events: Timed, *, last: bool) -> Segment:
-        """Write the events of one segment."""
+        """Return the function of a segment's events, with its received, sent and recorded rows."""
         type_, layout, peer_type = self.type_, self.layout, self.peer_type
         pairs = {
             key: pair
@@ -160,12 +160,12 @@ class _SegmentWriter:
             row for _, event in events if isinstance(event, Tick) for rows in event.input_rows for row in rows
         }
         received_rows = sorted(received - {row for pair in pairs.values() for row in pair.received})
-        moved = sum(isinstance(event, Propagate) for _, event in events)
+        propagations = sum(isinstance(event, Propagate) for _, event in events)
         sizes = {
             "carry": layout.ends[-1],
             "received": len(received_rows) + len(pairs),
             "constants": len(peer_type.parameters) + int(self.rates.pattern.sum()) * len(self.durations),
-            "impulses": len(self.rates.forced) * moved if self.rates.timed else 0,
+            "impulses": len(self.rates.forced) * propagations if self.rates.timed else 0,
             "frame": 1,
         }
         arguments = {name: type_.sym(name, size) for name, size in sizes.items()}
@@ -185,65 +185,75 @@ class _SegmentWriter:
                 first and now in self.schedule.sample_times
             ):  # the first event at an instant, which is then over
                 rows += [self._signal(signal, now) for signal in self.recorded]
-            self._step(now, event)
-        passed = [
+            self._apply_event(now, event)
+        later_values = [
             self.values[shifted(value, self.schedule.ticks) if last and value.index < 0 else value]
             for value in layout.later_values
         ]
         newest = [self.newest[key] for key in layout.outputs]
-        after = (self.x, *newest, self.u, *passed, self.work)
+        carry_after = (self.x, *newest, self.u, *later_values, self.work)
         kernel = casadi.Function(
             "segment",
             list(arguments.values()),
             [
-                _column(type_, after),
+                _column(type_, carry_after),
                 _column(type_, [self.sent[row] for row in sorted(self.sent)]),
                 _column(type_, rows),
             ],
             list(arguments),
             ["carry_after", "sent", "rows"],
         )
-        begin = self.sample_times, self.impulses
+        first_rows = self.sample_times, self.impulses
         self.sample_times += len(rows) // max(len(self.recorded), 1)
         self.impulses += sizes["impulses"]
-        return Segment(kernel, tuple(received_rows), tuple(pairs.values()), tuple(sorted(self.sent)), *begin)
+        return Segment(
+            kernel, tuple(received_rows), tuple(pairs.values()), tuple(sorted(self.sent)), *first_rows
+        )
 
     def _pairs(self, now: int, tick: Tick) -> dict[Any, Pairwise]:
-        """Return pairwise-reduction results by (tick, receive), from the relevant rows of x, u, m and p."""
-        computing, pairs, layout = self.peer_type.clocks[tick.partition], {}, self.layout
+        """Return the pairwise functions of a tick by (tick, receive), with the rows of the carry that
+        they read.
+        """
+        partition, pairs, layout = self.peer_type.clocks[tick.partition], {}, self.layout
         x, outputs, u, *_ = (range(*ends) for ends in zip(layout.ends, layout.ends[1:], strict=False))
-        memories = [outputs[layout.outputs.index((tick.partition, o))] for o in computing.memories]
-        inside = [*x, *u, *memories]
-        for index, (receive, rows) in enumerate(zip(computing.receives, tick.input_rows, strict=True)):
-            if rows and edge_name(computing, receive):
-                function, matter = pair_function(self.peer_type, tick.partition, index)
-                carry = tuple(inside[row] for row in matter if row < len(inside))
-                constants = tuple(row - len(inside) for row in matter if row >= len(inside))
+        memories = [outputs[layout.outputs.index((tick.partition, o))] for o in partition.memories]
+        available_rows = [*x, *u, *memories]
+        for index, (receive, rows) in enumerate(zip(partition.receives, tick.input_rows, strict=True)):
+            if rows and edge_name(partition, receive):
+                function, used_rows = pair_function(self.peer_type, tick.partition, index)
+                carry = tuple(available_rows[row] for row in used_rows if row < len(available_rows))
+                constants = tuple(
+                    row - len(available_rows) for row in used_rows if row >= len(available_rows)
+                )
                 pairs[tick, index] = Pairwise(function, carry, constants, rows, now)
         return pairs
 
-    def _p(self) -> Any:
+    def _parameter_values(self) -> Any:
+        """Return the parameters p, the first rows of the constants."""
         return self.constants[: len(self.peer_type.parameters)]
 
-    def _of_subsystem(self, function: Any, now: int) -> Any:
-        """Return a function of (x, u, p, t) at an instant."""
-        return function(self.x, self.u, self._p(), self._time(now))
+    def _evaluate(self, function: Any, now: int) -> Any:
+        """Return the value of a function (x, u, p, t) at an instant of the frame."""
+        return function(self.x, self.u, self._parameter_values(), self._seconds(now))
 
-    def _time(self, now: int) -> Any:
+    def _seconds(self, now: int) -> Any:
+        """Return the time in seconds of an instant of the frame."""
         return seconds_at(self.schedule, self.frame, now)
 
     def _signal(self, signal: LocalSignal, now: int) -> Any:
+        """Return the value of a recorded signal at an instant of the frame."""
         match signal.role:
             case "state":
                 return self.x[signal.index[0]]
             case "output":
                 return self.newest[signal.index[0], signal.index[1]]
             case "limited":
-                return self._of_subsystem(self.peer_type.limits[signal.index[0]].value, now)
+                return self._evaluate(self.peer_type.limits[signal.index[0]].value, now)
             case _:
                 return self.u[signal.index[0]]
 
-    def _step(self, now: int, event: Event) -> None:
+    def _apply_event(self, now: int, event: Event) -> None:
+        """Apply one event of the schedule to the symbolic values of the subsystem."""
         match event:
             case Propagate(duration):
                 self._propagate(now, self.durations.index(duration))
@@ -253,23 +263,29 @@ class _SegmentWriter:
                 u[hold] = self.values[value]
                 self.u = _column(self.type_, u)
             case SendEvent(partition, rows):
-                everything = self._of_subsystem(self.peer_type.sends[partition].send, now)
-                self.sent |= {row: everything[channel] for channel, row in rows}
+                channels = self._evaluate(self.peer_type.sends[partition].send, now)
+                self.sent |= {row: channels[channel] for channel, row in rows}
             case Tick(partition, index, received):
-                computing = self.peer_type.clocks[partition]
-                m = _column(self.type_, [self.newest[partition, o] for o in computing.memories])
+                clock_partition = self.peer_type.clocks[partition]
+                m = _column(self.type_, [self.newest[partition, o] for o in clock_partition.memories])
                 input_rows = [
                     self.received[event, position]
                     if (event, position) in self.received
-                    else self._sum(now, rows)
+                    else self._received_sum(now, rows)
                     for position, rows in enumerate(received)
                 ]
                 r = _column(self.type_, input_rows)
-                outputs = computing.tick(self.x, self.u, m, r, self._p(), self._time(now))
-                for o in range(len(computing.outputs)):
+                outputs = clock_partition.tick(
+                    self.x, self.u, m, r, self._parameter_values(), self._seconds(now)
+                )
+                for o in range(len(clock_partition.outputs)):
                     self.newest[partition, o] = self.values[ClockedValue(partition, o, index)] = outputs[o]
 
-    def _sum(self, now: int, rows: Sequence[int]) -> Any:
+    def _received_sum(self, now: int, rows: Sequence[int]) -> Any:
+        """Return the sum of received rows.
+
+        The row of missing packets is weighted by the subsystem's own packet.
+        """
         total = self.type_(0)
         for row in rows:
             received = self.schedule.all_received[row]
@@ -279,12 +295,12 @@ class _SegmentWriter:
                 sending = next(
                     send for send in self.peer_type.sends if send.link == received.coupling_term.link
                 )
-                weight = self._of_subsystem(sending.send, now)[sending.channels.index(received.channel)]
+                weight = self._evaluate(sending.send, now)[sending.channels.index(received.channel)]
             total = total + weight * self.received[row]
         return total
 
     def _propagate(self, now: int, index: int) -> None:
-        """Move x over one interval, and add up the work that held values do meanwhile."""
+        """Propagate x over one interval, and add the work of the held forces to the parts' work."""
         pattern, ports = self.rates.pattern, self.peer_type.ports
         size, before = int(pattern.sum()), self.x
         begin = len(self.peer_type.parameters) + index * size
@@ -296,21 +312,24 @@ class _SegmentWriter:
         for row in self.rates.forced if self.rates.timed else ():
             after[row] = after[row] + next(self.pushes)
         if self.flow is not None:
-            flowing = before[list(self.flow.rows)]
-            moved = self.moves[index](flowing, self.u, self._p(), self._time(now))
+            integrated = before[list(self.flow.rows)]
+            integrated_after = self.moves[index](
+                integrated, self.u, self._parameter_values(), self._seconds(now)
+            )
             for i, row in enumerate(self.flow.rows):
-                after[row] = moved[i]
+                after[row] = integrated_after[i]
         self.intervals.append((now, index))
-        old: Any = self._of_subsystem(ports.port, now) if ports else None
+        port_before: Any = self._evaluate(ports.port, now) if ports else None
         self.x = _column(self.type_, after)
         if ports:
-            n, new = len(ports.parts), self._of_subsystem(ports.port, now)
+            n, port_after = len(ports.parts), self._evaluate(ports.port, now)
             work = casadi.vertsplit(self.work)
             for i, part in enumerate(ports.parts):
-                at = self.layout.parts.index(part)
-                work[at] = work[at] - old[n + i] * (new[i] - old[i])
+                row_of_part = self.layout.parts.index(part)
+                work[row_of_part] = work[row_of_part] - port_before[n + i] * (port_after[i] - port_before[i])
             self.work = _column(self.type_, work)
 
 
 def _column(type_: Any, values: Sequence[Any]) -> Any:
+    """Return values as one dense column vector."""
     return casadi.densify(casadi.vertcat(type_(0, 1), *values))

@@ -3,7 +3,7 @@
 Takes: a `PeerType` and parameter vectors.
 Gives: `Rates`, `rates`, `transition_rows`, `perturbed`; `exact_rates`; `nonlinear_rows`.
 Guarantees: no step size; every entry of a transition is right to the last digit but one.
-Does not: integrate what is not linear (see `flow`), or know what changes with time alone (see `forcing`).
+Does not: integrate nonlinear equations (see `flow`), or time-varying forces (see `forcing`).
 
     dx/dt = A x + B u + g(t)        x(t + T) = E x(t) + F u + c,  u held
 """
@@ -22,11 +22,11 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import PeerType
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.interpolation import jacobian
-from apc.frame.discretize import discretize
-from apc.frame.exact_arithmetic import evaluate_exact
-from apc.frame.interval_arithmetic import value_of
-from apc.frame.jacobians import guards_of, structural_pattern
-from apc.frame.parameters import exact_numbers
+from apc.lifting.discretize import discretize
+from apc.lifting.interval_arithmetic import value_of
+from apc.linearization.jacobians import guards_of, structural_pattern
+from apc.parameter_values.exact_arithmetic import evaluate_exact
+from apc.parameter_values.parameters import exact_numbers
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -35,9 +35,9 @@ Pattern = NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rates:
-    """The continuous equations of a peer type, linear in x and u.
+    """The linear continuous equations of a peer type, dx/dt = A x + B u + g(t).
 
-    `matrices(p)` is [A B g] (n_x, n_x + n_u + 1), column-major, with the constant part of g. `timed` is
+    `matrices(p)` is [A B g] (n_x, n_x + n_u + 1), column-major, with the constant part of g. `timed` states
     whether g is time-varying: then g is zero there and given by `rate(p, t)`. `pattern` is the sparsity
     pattern of a transition [E F c] for all parameter values. States integrated by another method have no
     entries.
@@ -51,88 +51,88 @@ class Rates:
 
     @property
     def forced(self) -> Integers:
-        """The states that g can move."""
+        """The indices of the states on which g can have an effect."""
         return np.flatnonzero(self.pattern[:, -1])
 
 
 def nonlinear_rows(peer_type: PeerType) -> tuple[int, ...]:
-    """Return the states whose equations are not linear, and all that equations tie to them."""
-    moving, _, t, speed = _symbols(peer_type)
-    curved = _curved(speed, moving, t)
-    if not curved:
+    """Return the indices of the states with nonlinear equations, and of all states coupled to them."""
+    variables, _, t, derivative = _symbols(peer_type)
+    nonlinear = _nonlinear_states(derivative, variables, t)
+    if not nonlinear:
         return ()
-    tied = structural_pattern(peer_type.derivative.jac_sparsity(0, 0))
-    together = _closure(tied | tied.T)
-    return tuple(np.flatnonzero(together[:, curved].any(axis=1)).tolist())
+    coupling = structural_pattern(peer_type.derivative.jac_sparsity(0, 0))
+    coupled = _closure(coupling | coupling.T)
+    return tuple(np.flatnonzero(coupled[:, nonlinear].any(axis=1)).tolist())
 
 
 def rates(peer_type: PeerType, moved: Sequence[int] = ()) -> Rates:
-    """Extract the linear continuous equations of a peer type.
+    """Return the linear continuous equations of a peer type.
 
     Parameters
     ----------
     peer_type
         The peer type.
     moved
-        States integrated by another method, with all states coupled to them.
+        Indices of the states integrated by another method.
 
     Raises
     ------
     ApcError
-        E870 the others' equations are not linear.
+        E870 a nonlinear equation of another state.
     """
-    moving, p, t, speed = _symbols(peer_type)
-    n_x, type_ = len(peer_type.states), type(moving)
-    local: Pattern = ~np.isin(np.arange(n_x), list(moved))
-    curved = [row for row in _curved(speed, moving, t) if local[row]]
-    if curved:
-        raise _nonlinear(peer_type, curved, speed, moving, p)
-    dm = casadi.sparsify(casadi.diag(casadi.DM(local.astype(float))))
-    slopes = dm @ jacobian(speed, moving)
-    still = dm @ peer_type.derivative(type_.zeros(n_x), type_.zeros(len(peer_type.holds)), p, t)
-    if type_ is casadi.MX:  # the same wherever they are taken, but a loop's solution is of somewhere
-        at = casadi.Function("slopes", [moving, p, t], [slopes])
-        slopes = at(type_.zeros(moving.numel()), p, 0)
-    timed = bool(still.numel() and casadi.depends_on(still, t))
-    constant = type_.zeros(n_x, 1) if timed else casadi.densify(still)
+    variables, p, t, derivative = _symbols(peer_type)
+    n_x, type_ = len(peer_type.states), type(variables)
+    own: Pattern = ~np.isin(np.arange(n_x), list(moved))
+    nonlinear = [row for row in _nonlinear_states(derivative, variables, t) if own[row]]
+    if nonlinear:
+        raise _nonlinear_error(peer_type, nonlinear, derivative, variables, p)
+    selection = casadi.sparsify(casadi.diag(casadi.DM(own.astype(float))))
+    slopes = selection @ jacobian(derivative, variables)
+    offset = selection @ peer_type.derivative(type_.zeros(n_x), type_.zeros(len(peer_type.holds)), p, t)
+    if type_ is casadi.MX:  # constant slopes, but a loop's solution must be evaluated at some point
+        slopes_at = casadi.Function("slopes", [variables, p, t], [slopes])
+        slopes = slopes_at(type_.zeros(variables.numel()), p, 0)
+    timed = bool(offset.numel() and casadi.depends_on(offset, t))
+    constant = type_.zeros(n_x, 1) if timed else casadi.densify(offset)
     structure = structural_pattern(slopes)
-    pushed: Pattern = np.ones(n_x, dtype=bool)
+    forced_rows: Pattern = np.ones(n_x, dtype=bool)
     if type_ is casadi.SX:
-        pushed = structural_pattern(casadi.sparsify(still))[:, 0]
-    flat = casadi.vec(casadi.horzcat(casadi.densify(slopes), constant))
+        forced_rows = structural_pattern(casadi.sparsify(offset))[:, 0]
+    entries = casadi.vec(casadi.horzcat(casadi.densify(slopes), constant))
     if type_ is casadi.MX:  # which includes the symbols of the other rows, even if unused
-        flat = casadi.substitute([flat], [moving, t], [type_.zeros(*moving.shape), type_(0)])[0]
+        entries = casadi.substitute([entries], [variables, t], [type_.zeros(*variables.shape), type_(0)])[0]
     reach = _closure(structure[:, :n_x])
-    inputs = np.hstack([structure[:, n_x:], pushed[:, None]])
+    inputs = np.hstack([structure[:, n_x:], forced_rows[:, None]])
     return Rates(
         peer_type=peer_type,
-        matrices=casadi.Function("matrices", [p], [flat]),
-        rate=casadi.Function("rate", [p, t], [casadi.densify(still)]),
+        matrices=casadi.Function("matrices", [p], [entries]),
+        rate=casadi.Function("rate", [p, t], [casadi.densify(offset)]),
         timed=timed,
-        pattern=np.hstack([reach, (reach.astype(int) @ inputs.astype(int)) > 0]) & local[:, None],
+        pattern=np.hstack([reach, (reach.astype(int) @ inputs.astype(int)) > 0]) & own[:, None],
     )
 
 
-def perturbed(exact: Sequence[Floats], seed: int) -> tuple[Floats, ...]:
-    """Return the same transitions with every number off by one rounding, up or down by chance.
+def perturbed(transitions: Sequence[Floats], seed: int) -> tuple[Floats, ...]:
+    """Return transitions with every coefficient changed by one rounding, up or down at random.
 
     Parameters
     ----------
-    exact
-        The transitions.
+    transitions
+        The exact transitions.
     seed
-        Of the chance.
+        The seed of the random directions.
     """
-    chance = np.random.default_rng(seed)
-    directions = (np.where(chance.random(matrix.shape) < 0.5, -np.inf, np.inf) for matrix in exact)
+    generator = np.random.default_rng(seed)
+    directions = (np.where(generator.random(matrix.shape) < 0.5, -np.inf, np.inf) for matrix in transitions)
     return tuple(
-        np.where(matrix == 0, 0.0, np.nextafter(matrix, towards))
-        for matrix, towards in zip(exact, directions, strict=True)
+        np.where(matrix == 0, 0.0, np.nextafter(matrix, direction))
+        for matrix, direction in zip(transitions, directions, strict=True)
     )
 
 
 def exact_rates(rates_of: Rates, parameters: Floats) -> NDArray[Any]:
-    """Return [A B g] (n_x, n_x + n_u + 1) of a subsystem, exact."""
+    """Return [A B g] (n_x, n_x + n_u + 1) of a subsystem, as exact rationals."""
     peer_type = rates_of.peer_type
     n_x, n_u = len(peer_type.states), len(peer_type.holds)
     if rates_of.matrices.is_a("SXFunction"):
@@ -147,8 +147,7 @@ def exact_rates(rates_of: Rates, parameters: Floats) -> NDArray[Any]:
 def transition_rows(rates_of: Rates, vectors: Floats, durations: Sequence[Fraction]) -> tuple[Floats, ...]:
     """Return the transitions [E F c] of subsystems, (subsystems, n_x, n_x + n_u + 1) for every duration.
 
-    Subsystems that differ in nothing the continuous equations read share a transition: each takes half a
-    millisecond.
+    Subsystems with equal continuous equations share a transition: each takes half a millisecond to compute.
 
     Parameters
     ----------
@@ -157,43 +156,47 @@ def transition_rows(rates_of: Rates, vectors: Floats, durations: Sequence[Fracti
     vectors
         The subsystems' parameters (subsystems, n_p).
     durations
-        In seconds.
+        The durations in seconds.
 
     Raises
     ------
     ApcError
-        E806 something grows beyond the range of floats within a duration.
+        E806 a transition that overflows within a duration.
     """
     n_x, width = rates_of.pattern.shape
-    flat = np.asarray(rates_of.matrices.map(len(vectors))(vectors.T), np.float64).T
-    at_least_single_column = np.hstack([flat, np.zeros((len(flat), 1))])
-    _, first, which = np.unique(at_least_single_column, axis=0, return_index=True, return_inverse=True)
+    entries = np.asarray(rates_of.matrices.map(len(vectors))(vectors.T), np.float64).T
+    at_least_single_column = np.hstack([entries, np.zeros((len(entries), 1))])
+    _, first, index_of = np.unique(at_least_single_column, axis=0, return_index=True, return_inverse=True)
     result = [np.empty((len(first), n_x, width)) for _ in durations]
     for index, row in enumerate(first.tolist()):
-        whole = exact_rates(rates_of, vectors[row])
-        for matrix, step in zip(result, discretize(whole[:, :n_x], whole[:, n_x:], durations), strict=True):
+        exact = exact_rates(rates_of, vectors[row])
+        for matrix, step in zip(result, discretize(exact[:, :n_x], exact[:, n_x:], durations), strict=True):
             matrix[index] = value_of(step)
-    return tuple(matrix[which.reshape(-1)] for matrix in result)
+    return tuple(matrix[index_of.reshape(-1)] for matrix in result)
 
 
 def _symbols(peer_type: PeerType) -> tuple[Any, Any, Any, Any]:
-    """Return (x, u), p and t as symbols, and the rates of change."""
+    """Return the symbols of (x, u), p and t, and dx/dt in these symbols."""
     type_: Any = casadi.SX if peer_type.derivative.is_a("SXFunction") else casadi.MX
     n_x, n_u = len(peer_type.states), len(peer_type.holds)
-    moving, p, t = type_.sym("moving", n_x + n_u), type_.sym("p", len(peer_type.parameters)), type_.sym("t")
-    x, u = casadi.vertsplit(moving, [0, n_x, n_x + n_u])
-    return moving, p, t, peer_type.derivative(x, u, p, t)
+    variables, p, t = (
+        type_.sym("moving", n_x + n_u),
+        type_.sym("p", len(peer_type.parameters)),
+        type_.sym("t"),
+    )
+    x, u = casadi.vertsplit(variables, [0, n_x, n_x + n_u])
+    return variables, p, t, peer_type.derivative(x, u, p, t)
 
 
-def _curved(speed: Any, moving: Any, t: Any) -> list[int]:
-    """Return the rates that are not linear in the states: their slopes change, or they jump."""
-    slopes = jacobian(speed, moving)
-    varies = casadi.vertcat(moving, t)
+def _nonlinear_states(derivative: Any, variables: Any, t: Any) -> list[int]:
+    """Return the indices of the rates that are not linear in the states: varying slopes, or jumps."""
+    slopes = jacobian(derivative, variables)
+    arguments = casadi.vertcat(variables, t)
     return [
         row
-        for row in range(speed.numel())
-        if (slopes[row, :].nnz() and casadi.depends_on(slopes[row, :], varies))
-        or (isinstance(speed, casadi.SX) and guards_of(speed[row], moving))
+        for row in range(derivative.numel())
+        if (slopes[row, :].nnz() and casadi.depends_on(slopes[row, :], arguments))
+        or (isinstance(derivative, casadi.SX) and guards_of(derivative[row], variables))
     ]
 
 
@@ -205,14 +208,16 @@ def _closure(a: Pattern) -> Pattern:
     return reach
 
 
-def _nonlinear(peer_type: PeerType, rows: Sequence[int], speed: Any, moving: Any, p: Any) -> ApcError:
-    """Return the mistake that names the states and the parts whose equations are not linear."""
+def _nonlinear_error(
+    peer_type: PeerType, rows: Sequence[int], derivative: Any, variables: Any, p: Any
+) -> ApcError:
+    """Return the error E870 with the states and the parts whose equations are not linear."""
     involved = []
     for row in rows:
-        guards = guards_of(speed[row], moving) if isinstance(speed, casadi.SX) else []
-        bends = casadi.jacobian(casadi.jacobian(speed[row], moving).T, moving)
-        varies = casadi.vertcat(casadi.vec(bends), *guards)
-        reads = casadi.which_depends(varies, p, 1, False) if p.numel() else ()
+        guards = guards_of(derivative[row], variables) if isinstance(derivative, casadi.SX) else []
+        second_derivatives = casadi.jacobian(casadi.jacobian(derivative[row], variables).T, variables)
+        nonlinear_terms = casadi.vertcat(casadi.vec(second_derivatives), *guards)
+        reads = casadi.which_depends(nonlinear_terms, p, 1, False) if p.numel() else ()
         parts = {
             name.rpartition(".")[0] for name, read in zip(peer_type.parameters, reads, strict=True) if read
         }
@@ -223,8 +228,8 @@ def _nonlinear(peer_type: PeerType, rows: Sequence[int], speed: Any, moving: Any
     through = f" through {' and '.join(sorted(shared))}" if shared else ""
     names = ", ".join(peer_type.states[row].name for row in rows)
     message = (
-        f"the motion of {names} is not linear between the ticks{through}: only what is linear "
-        "there can be simulated exactly"
+        f"the motion of {names} is not linear between the ticks{through}: exact simulation needs "
+        "a linear motion there"
     )
-    hint = "no --method (what is linear stays exact), or a part that computes its force at ticks of a clock"
-    return ApcError(Diagnostic("E870", SourceLocation(peer_type.name), message, hint=hint))
+    advice = "omit --method, or compute the force at ticks of a clock"
+    return ApcError(Diagnostic("E870", SourceLocation(peer_type.name), message, advice=advice))

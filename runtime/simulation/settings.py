@@ -7,8 +7,8 @@ Does not: integrate (see `propagate`, `flow`, `integrate`), or select signals (s
 
     exact              the exact transition; refused where an equation is not linear
     rk4:STEP           the classical method of Runge and Kutta, of order 4
-    semi-implicit:STEP velocities first, then positions with the new velocities, of order 1: what haptic
-                       engines do
+    semi-implicit:STEP velocities first, then positions with the new velocities, of order 1, as in
+                       haptic rendering engines
     cvodes:RTOL        CVODES of SUNDIALS, variable order and step, to a relative tolerance
 
 Steps end at every event, the last one before it shorter if necessary. By default linear equations use the
@@ -30,20 +30,21 @@ WHERE_NEEDED = "exact where linear"
 EXAMPLES = {EXACT: "exact", RK4: "rk4:0.1ms", SEMI_IMPLICIT: "semi-implicit:1ms", CVODES: "cvodes:1e-10"}
 ORDERS = {RK4: 4, SEMI_IMPLICIT: 1}
 
-# Of the default. CVODES holds the error of each step below it; over the restarts of a run, hundreds to
-# thousands of them, errors add up: to 200 times as much in a soft contact, 900 in a stiff one (see
+# The default tolerance of CVODES for the error of each step. Over the hundreds to thousands of restarts of a
+# run errors add up: to 200 times the tolerance in a soft contact, 900 times in a stiff one (see
 # tests/bench/work_precision.py).
 TOLERANCE = 1e-10
-TIGHTEST, LOOSEST = 1e-12, 1e-2  # a hundred times tighter than 1e-12 is what double precision still gives
+TIGHTEST, LOOSEST = 1e-12, 1e-2  # the comparison run, 100 times tighter, is the limit of double precision
 TIGHTER = 100.0
 MOST_STEPS = 10**6  # between two events
 
 
 @dataclass(frozen=True, slots=True)
 class Method:
-    """`step` in seconds is of the methods with a fixed step, `tolerance` (relative) of CVODES.
+    """An integration method: `step` in seconds for a fixed step, `tolerance` (relative) for CVODES.
 
-    `perturbed` marks a run that shows what roundings do: every coefficient of its transitions is off by one.
+    `perturbed` states that every coefficient of the transitions is changed by one rounding, to estimate the
+    effect of rounding.
     """
 
     name: str
@@ -67,9 +68,9 @@ DEFAULT = Method(WHERE_NEEDED, tolerance=TOLERANCE)
 class Settings:
     """The settings of a simulation.
 
-    `duration` is in seconds, the last row that of the last tick until then; `method` is the integration
-    method between events; `seed` that of random losses, None for the experiment's; `jit` is whether to
-    compile to machine code if a C compiler exists.
+    `duration` is in seconds; the last row is that of the last tick within it. `method` is the integration
+    method between events; `seed` is the seed of random losses, None for that of the experiment; `jit` states
+    whether to compile to machine code if a C compiler exists.
     """
 
     duration: Fraction
@@ -79,29 +80,29 @@ class Settings:
 
 
 def parse_method(text: str) -> Method:
-    """Read a method.
+    """Return the integration method of a text such as "rk4:0.1 ms".
 
     Parameters
     ----------
     text
-        Such as "exact", "rk4:0.1 ms", "semi-implicit:1ms" or "cvodes:1e-8".
+        A text such as "exact", "rk4:0.1 ms", "semi-implicit:1ms" or "cvodes:1e-8".
 
     Raises
     ------
     ApcError
-        E910 no such method, E911 a step that is none, E912 a tolerance that is none.
+        E910 an unknown method, E911 an invalid step, E912 an invalid tolerance.
     """
     name, colon, size = (part.strip() for part in text.partition(":"))
     location = SourceLocation("--method")
     if name not in EXAMPLES:
-        meant = nearest(name, EXAMPLES) or EXACT
+        nearest_name = nearest(name, EXAMPLES) or EXACT
         expected = f"one of {', '.join(EXAMPLES)}"
         got = text[:80] or "nothing"
-        raise ApcError(Diagnostic("E910", location, "the method", expected, got, EXAMPLES[meant]))
+        raise ApcError(Diagnostic("E910", location, "method", expected, got, EXAMPLES[nearest_name]))
     if name == EXACT:
         if colon:
-            expected = "exact alone, which has no step"
-            raise ApcError(Diagnostic("E910", location, "the method", expected, text[:80], EXACT))
+            expected = "exact without a step"
+            raise ApcError(Diagnostic("E910", location, "method", expected, text[:80], EXACT))
         return Method(EXACT)
     if name == CVODES:
         return Method(CVODES, tolerance=_tolerance(size, location))
@@ -112,29 +113,30 @@ def parse_method(text: str) -> Method:
         expected = "a step"
         raise ApcError(Diagnostic("E911", location, name, expected, "none", EXAMPLES[name]))
     try:
-        step = Fraction(quantity(size, location, subject=f"the step of {name}", unit="s").value)
+        step = Fraction(quantity(size, location, subject=f"step of {name}", unit="s").value)
     except ApcError as error:
-        raise ApcError([replace(mistake, hint=EXAMPLES[name]) for mistake in error.mistakes]) from None
+        raise ApcError([replace(mistake, fix=EXAMPLES[name]) for mistake in error.mistakes]) from None
     if step <= 0:
         expected, got = "more than 0 s", size[:80]
-        raise ApcError(Diagnostic("E911", location, f"the step of {name}", expected, got, EXAMPLES[name]))
+        raise ApcError(Diagnostic("E911", location, f"step of {name}", expected, got, EXAMPLES[name]))
     return Method(name, step=step)
 
 
 def _tolerance(text: str, location: SourceLocation) -> float:
+    """Return the tolerance of a text; an error E912 if it is no number or out of range."""
     try:
         value = plain_float(text)
     except ValueError:
         value = 0.0
     if not TIGHTEST <= value <= LOOSEST:
         expected = f"a number from {TIGHTEST:g} to {LOOSEST:g}"
-        message, got = "the relative tolerance of cvodes", text[:80] or "none"
+        message, got = "relative tolerance of cvodes", text[:80] or "none"
         raise ApcError(Diagnostic("E912", location, message, expected, got, EXAMPLES[CVODES]))
     return value
 
 
 def check_step(system: Model, method: Method, fastest: Fraction, longest: Fraction) -> None:
-    """Refuse a step that the model has no room for.
+    """Raise E913 for a fixed step that is longer than the fastest clock's period, or far too short.
 
     Parameters
     ----------
@@ -154,30 +156,31 @@ def check_step(system: Model, method: Method, fastest: Fraction, longest: Fracti
     """
     if method.step is None:
         return
-    location, message = SourceLocation(system.origin.topology), f"the step of {method.name}"
+    location, message = SourceLocation(system.origin.topology), f"step of {method.name}"
     if method.step > fastest:
         expected = f"at most the period of the fastest clock, {_ms(fastest)}"
-        hint = f"--method {method.name}:{no_more(1000 * fastest)}ms"
-        raise ApcError(Diagnostic("E913", location, message, expected, _ms(method.step), hint))
+        fix = f"--method {method.name}:{no_more(1000 * fastest)}ms"
+        raise ApcError(Diagnostic("E913", location, message, expected, _ms(method.step), fix))
     if longest / method.step > MOST_STEPS:
         expected = f"at least {_ms(longest / MOST_STEPS)}, a millionth of the time between two events"
         raise ApcError(Diagnostic("E913", location, message, expected, _ms(method.step)))
 
 
 def _ms(seconds: Fraction) -> str:
+    """Return a time as text in milliseconds."""
     return f"{1000 * float(seconds):g} ms"
 
 
 def finer(method: Method, *, all_linear: bool) -> tuple[Method, float]:
-    """Return the method for comparison, and the ratio of the error to the difference from it.
+    """Return a more accurate method, and the ratio of the error to the difference between the two methods.
 
     Halving the step of a method of order n leaves 1/2ⁿ of the error, so that the error is 1/(1 − 1/2ⁿ) of the
-    difference (Richardson). A hundredth of the tolerance leaves next to none of it.
+    difference (Richardson). A hundredth of the tolerance leaves a negligible part of the error.
 
     Parameters
     ----------
     method
-        The method whose error is wanted.
+        The method whose error is estimated.
     all_linear
         Whether all equations of the model are linear between the ticks.
     """

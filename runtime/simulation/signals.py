@@ -21,17 +21,18 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import Model, PeerType
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation, nearest
-from apc.frame.schedule import HoldUpdate, Propagate, Schedule, Tick
+from apc.timing.schedule import HoldUpdate, Propagate, Schedule, Tick
 
 EXAMPLE = "'cube.x', 'left[2].*' or '*.v'"
 
 
 @dataclass(frozen=True, slots=True)
 class LocalSignal:
-    """Something of a subsystem that can be recorded.
+    """A recordable signal of a subsystem.
 
-    `role` is "state", "output" (as newly computed), "hold" (acting) or "limited" (of what has a limit and is
-    none of these); `index` is the state, the (clock partition, output), the hold, or the limit.
+    `role` is "state", "output" (as newly computed), "hold" (acting) or "limited" (a limited value that is
+    none of these); `index` is that of the state, of the (clock partition, output), of the hold, or of the
+    limit.
     """
 
     name: str
@@ -43,8 +44,8 @@ class LocalSignal:
 def local_signals(peer_type: PeerType, schedule: Schedule) -> tuple[LocalSignal, ...]:
     """Return the recordable signals of a subsystem.
 
-    A value that takes effect when computed is one signal; one that takes effect later is two: `contact.f` as
-    computed, and `contact.f active_at_start`.
+    A value that takes effect when computed is one signal; a value that takes effect later is two: `contact.f`
+    as computed, and `contact.f acting`.
     """
     signals = [
         LocalSignal(state.name, state.unit, "state", (index,)) for index, state in enumerate(peer_type.states)
@@ -56,11 +57,11 @@ def local_signals(peer_type: PeerType, schedule: Schedule) -> tuple[LocalSignal,
             LocalSignal(name, unit, "output", (p, o))
             for o, (name, unit) in enumerate(zip(partition.outputs, partition.units, strict=True))
         ]
-    numbers = {partition.clock: p for p, partition in enumerate(peer_type.clocks)}
-    late = _late_holds(schedule)
+    partition_of = {partition.clock: p for p, partition in enumerate(peer_type.clocks)}
+    delayed = _late_holds(schedule)
     for h, hold in enumerate(peer_type.holds):
-        p = numbers[hold.clock]
-        if h in late:
+        p = partition_of[hold.clock]
+        if h in delayed:
             unit = peer_type.clocks[p].units[hold.output]
             signals.append(LocalSignal(f"{hold.name} acting", unit, "hold", (h,)))
     signals += [
@@ -72,43 +73,45 @@ def local_signals(peer_type: PeerType, schedule: Schedule) -> tuple[LocalSignal,
 
 
 def sent_states(peer_type: PeerType) -> tuple[int, ...]:
-    """Return the states, by their places, that a subsystem sends to others as they are."""
-    numbers = []
-    for sending in peer_type.sends:
-        if sending.send.is_a("SXFunction"):
-            inputs = sending.send.sx_in()
-            channels = sending.send(*inputs)
-            numbers += [
+    """Return the indices of the states that a subsystem sends to others unchanged."""
+    indices = []
+    for send in peer_type.sends:
+        if send.send.is_a("SXFunction"):
+            inputs = send.send.sx_in()
+            channels = send.send(*inputs)
+            indices += [
                 index
                 for row in range(channels.numel())
                 for index in range(len(peer_type.states))
                 if casadi.is_equal(channels[row], inputs[0][index])
             ]
-    return tuple(dict.fromkeys(numbers))
+    return tuple(dict.fromkeys(indices))
 
 
 def ticking_partitions(schedule: Schedule) -> list[int]:
-    """Return the clock partitions that tick in a frame."""
+    """Return the indices of the clock partitions that tick in a frame, in order."""
     return sorted({event.partition for event in schedule.events if isinstance(event, Tick)})
 
 
 def _late_holds(schedule: Schedule) -> set[int]:
-    """Return the holds that put out a value later than it is computed."""
+    """Return the indices of the holds that output a value later than it is computed."""
     computed: set[tuple[int, int]] = set()
-    late = set()
+    delayed = set()
     for event in schedule.events:
         if isinstance(event, Propagate):
             computed = set()
         elif isinstance(event, Tick):
             computed.add((event.partition, event.index))
         elif isinstance(event, HoldUpdate) and (event.value.partition, event.value.index) not in computed:
-            late.add(event.hold)
-    return late
+            delayed.add(event.hold)
+    return delayed
 
 
 @dataclass(frozen=True, slots=True)
 class Signal:
-    """One column of a trajectory: `local` (such as `cube.x`) of peer number `peer` (from 1) of a group."""
+    """One column of a trajectory: the signal `local` (such as `cube.x`) of peer number `peer` (from 1) of
+    a group.
+    """
 
     group: str
     peer: int
@@ -118,18 +121,18 @@ class Signal:
 
     @property
     def name(self) -> str:
-        """The whole name, as in `left[2].cube.x`."""
+        """The complete name, such as `left[2].cube.x`."""
         return f"{self.group}[{self.peer}].{self.local}"
 
     @property
     def heading(self) -> str:
-        """The name with its unit, as in `left[2].cube.x [m]`."""
+        """The name with its unit, such as `left[2].cube.x [m]`."""
         return f"{self.name} [{self.unit}]"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SignalSelection:
-    """The recorded signals of a group: `locals` of every peer, selected by `selected` (peers, locals)."""
+    """The recorded signals of a group: the signals `locals`, and `selected` (peers, signals)."""
 
     locals: tuple[LocalSignal, ...]
     selected: NDArray[np.bool_]
@@ -138,7 +141,7 @@ class SignalSelection:
 def choose(
     system: Model, available: Sequence[Sequence[LocalSignal]], patterns: Sequence[str]
 ) -> tuple[SignalSelection, ...]:
-    """Choose the signals that fit some pattern, all of them if there is none.
+    """Return the signals of each group that match some pattern; without patterns, all signals.
 
     Parameters
     ----------
@@ -147,38 +150,38 @@ def choose(
     available
         The recordable signals of a peer of each group.
     patterns
-        Names with `*` for any text and `?` for any character; without a group they mean every peer's, and
-        with a group's name alone every one's of it.
+        Names with `*` for any text and `?` for any character. A name without a group matches the signal of
+        every peer, a name with a group but no number that of every peer of the group.
 
     Raises
     ------
     ApcError
         E873 a pattern fits no signal.
     """
-    tests = [(pattern, _test(pattern)) for pattern in patterns]
+    tests = [(pattern, _expression(pattern)) for pattern in patterns]
     used: set[str] = set()
     choices = []
     for group, local_signals in zip(system.groups, available, strict=True):
-        requested = np.full((group.count, len(local_signals)), not patterns)
+        selected = np.full((group.count, len(local_signals)), not patterns)
         for pattern, test in tests:
             for index, local in enumerate(local_signals):
-                fits = [any(test.fullmatch(text) for text in (local.name, f"{group.name}.{local.name}"))]
-                if not fits[0] and ("[" in pattern or pattern.startswith(("*", group.name))):
+                matches = [any(test.fullmatch(text) for text in (local.name, f"{group.name}.{local.name}"))]
+                if not matches[0] and ("[" in pattern or pattern.startswith(("*", group.name))):
                     names = (f"{group.name}[{i + 1}].{local.name}" for i in range(group.count))
-                    fits = [bool(test.fullmatch(name)) for name in names]
-                requested[:, index] |= fits
-                used |= {pattern} if any(fits) else set()
-        recorded = np.flatnonzero(requested.any(axis=0))
+                    matches = [bool(test.fullmatch(name)) for name in names]
+                selected[:, index] |= matches
+                used |= {pattern} if any(matches) else set()
+        recorded = np.flatnonzero(selected.any(axis=0))
         locals_ = tuple(local_signals[index] for index in recorded.tolist())
-        choices.append(SignalSelection(locals_, np.ascontiguousarray(requested[:, recorded])))
+        choices.append(SignalSelection(locals_, np.ascontiguousarray(selected[:, recorded])))
     for pattern in patterns:
         if pattern not in used:
-            _refuse(system, available, pattern)
+            _raise_no_match(system, available, pattern)
     return tuple(choices)
 
 
 def signals_of(system: Model, choices: Sequence[SignalSelection]) -> tuple[Signal, ...]:
-    """Return the chosen signals, in order."""
+    """Return the selected signals of all peers, in the order of the model."""
     return tuple(
         Signal(group.name, peer + 1, local.name, local.unit, local.role)
         for group, choice in zip(system.groups, choices, strict=True)
@@ -188,18 +191,22 @@ def signals_of(system: Model, choices: Sequence[SignalSelection]) -> tuple[Signa
     )
 
 
-def _test(pattern: str) -> re.Pattern[str]:
-    """Return the matches of a pattern; brackets are part of names."""
+def _expression(pattern: str) -> re.Pattern[str]:
+    """Return the regular expression of a pattern; brackets are part of names."""
     return re.compile(re.escape(pattern.strip()).replace(r"\*", ".*").replace(r"\?", "."))
 
 
-def _refuse(system: Model, available: Sequence[Sequence[LocalSignal]], pattern: str) -> None:
+def _raise_no_match(system: Model, available: Sequence[Sequence[LocalSignal]], pattern: str) -> None:
+    """Raise the error E873 for a pattern without a match, with the nearest name."""
     names = dict.fromkeys(local.name for local_signals in available for local in local_signals)
     names |= dict.fromkeys(
         f"{group.name}[1].{local.name}"
         for group, local_signals in zip(system.groups, available, strict=True)
         for local in local_signals
     )
-    message = f"no signal fits {pattern[:80]!r}; the signals of a peer are {', '.join(list(names)[:12])}"
-    hint = f"--signals {nearest(pattern, names)}" if nearest(pattern, names) else f"names such as {EXAMPLE}"
-    raise ApcError(Diagnostic("E873", SourceLocation(system.origin.topology), message, hint=hint))
+    message = f"no signal matches {pattern[:80]!r}; the signals of a peer are {', '.join(list(names)[:12])}"
+    near = nearest(pattern, names)
+    fix, advice = (f"--signals {near}", "") if near else ("", f"use names such as {EXAMPLE}")
+    raise ApcError(
+        Diagnostic("E873", SourceLocation(system.origin.topology), message, fix=fix, advice=advice)
+    )

@@ -1,6 +1,6 @@
 """Preparation of a simulation: all peers, their exchange, recorded signals, and the engine.
 
-Takes: a `Model`, its `Settings`, the signals wanted.
+Takes: a `Model`, its `Settings`, the signals to record.
 Gives: `SimulationPlan`, `plan_of`; `Simulation`, `prepare`; `check_length`, `size_note`, its expected size.
 Guarantees: time is an integer number of quanta. A simulation that would exceed the memory is refused before
 it is built.
@@ -22,16 +22,12 @@ from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.timings import part
 from apc.compiler.wording import no_more
-from apc.frame.communication_graph import CommunicationGraph, build_exchange
-from apc.frame.data_age import stamped
-from apc.frame.evaluation_errors import finite_equations
-from apc.frame.jacobians import SubsystemJacobians, jacobians
-from apc.frame.parameters import ResolvedNumbers, resolve
-from apc.frame.schedule import Propagate, Schedule
-from apc.frame.scheduling import build_schedules
-from apc.memory import refuse_beyond
+from apc.lifting.data_age import stamped
+from apc.linearization.evaluation_errors import finite_equations
+from apc.linearization.jacobians import SubsystemJacobians, jacobians
 from apc.network.nominal_criterion import refuse_range
 from apc.network.packet_schedule import ArrivalProcess, Route, Timetable, arrival_process_of, routes_of
+from apc.parameter_values.parameters import ResolvedNumbers, resolve
 from apc.simulation.compiled_engine import CompiledEngine, LoadedLibrary, library_of
 from apc.simulation.flow import Flow, Tolerance, flow_of, rows_to_move, state_scales
 from apc.simulation.forcing import SubsystemForcing, subsystem_forcing
@@ -57,20 +53,24 @@ from apc.simulation.signals import (
     sent_states,
     signals_of,
 )
+from apc.support.memory import refuse_beyond
+from apc.timing.communication_graph import CommunicationGraph, build_exchange
+from apc.timing.schedule import Propagate, Schedule
+from apc.timing.scheduling import build_schedules
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-# Numbers that one call of a player takes and gives out, at most, if a frame has fewer: 4 MiB stay in the
-# machine's caches.
+# Limit of the numbers that one call of an engine reads and returns, if one frame has fewer: 4 MiB stay in the
+# processor's caches.
 CHUNK = 2**19
 ROW = Fraction(1, 1000)  # seconds from row to row of a model in which nothing ticks
-MOST_FRAMES = 2000  # of one chunk: what has left the range of floats is noticed at its end
-NUMBERS_A_PAIR = 16  # what one peer looks at of itself and of another, mostly
-NUMBER = 64  # bytes of a number of all peers' frame, with what CasADi copies
+MOST_FRAMES = 2000  # of one chunk: an overflow is detected at its end only
+NUMBERS_A_PAIR = 16  # typical number of values that one pairwise evaluation reads
+NUMBER = 64  # bytes of memory for one stored number, with CasADi's copies
 
-# Rows of one command, all runs together: at a microsecond a row and peer, which machine code needs, some
-# hours. At 1 kHz it is eleven days of simulated time.
+# Limit of the rows of one command, over all runs: some hours at a microsecond per row and peer, the speed of
+# machine code. At 1 kHz it is eleven days of simulated time.
 MOST_ROWS = 10**9
 
 # File size from which a note is printed beforehand: 1 GB.
@@ -82,16 +82,15 @@ BINARY, DECIMAL = 8, 20
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Simulation:
-    """A topology prepared for simulation.
+    """A model prepared for simulation.
 
-    `signals` are the columns of what comes out, the `order` (signals,) of which in a row of the population is
-    another; `sample_times` the instants of a frame's rows, in quanta, the first of which makes a row at time
-    0 only unless `ticks_at_zero`; `forces` are those that change with time, of each member's different
-    subsystems. `arrival_processes` are what chance does on the unreliable links, `seed` is what it begins
-    from: that of the settings, or of the experiment. `library` is the machine code, None if there is none.
-    `length` frames are simulated at a time. `topology` is the system as it was given, without stamps on its
-    packets (see `data_age.stamped`). `tolerances` are of the states that CVODES moves, `sent` the names of
-    those that peers send as they are.
+    `signals` are the columns of the output; `order` (signals,) are their indices in a row of the population.
+    `sample_times` are the instants of a frame's rows, in quanta; the first one gives a row at time 0 only,
+    unless `ticks_at_zero`. `forces` are the time-varying forces on each member's different subsystems.
+    `arrival_processes` are the random losses and delays of the unreliable links, with the seed `seed`.
+    `library` is the machine code, None if there is none. `length` frames are simulated per chunk. `topology`
+    is the given model, without time stamps on its packets (see `data_age.stamped`). `tolerances` are those of
+    the states integrated by CVODES, `sent` the names of the states that peers send unchanged.
     """
 
     system: Model
@@ -114,7 +113,7 @@ class Simulation:
 
     @property
     def how(self) -> str:
-        """The method in command-line notation; "exact" if exact throughout."""
+        """The integration method in command-line notation; "exact" if all transitions are exact."""
         method = self.settings.method
         if method.name != WHERE_NEEDED:
             return str(method)
@@ -122,11 +121,11 @@ class Simulation:
 
     @property
     def rows(self) -> int:
-        """The largest number of rows: that of complete frames."""
+        """An upper bound on the number of rows: that of complete frames."""
         return (int(self.settings.duration / self.quantum) // self.frame + 1) * len(self.sample_times)
 
     def player(self) -> FrameEngine:
-        """Return the engine, with separate memory."""
+        """Return a new engine for this simulation, with its own memory."""
         routes = self.population.exchange_program.routes
         timetable = partial(Timetable, routes, self.arrival_processes, seed=self.seed)
         packets = (lambda run: timetable(run=run)) if routes else None
@@ -143,7 +142,7 @@ def prepare(
     signals: Sequence[str] = (),
     live: bool = False,
 ) -> Simulation:
-    """Prepare a simulation up to the first instant.
+    """Return a model prepared for simulation, at time 0.
 
     Parameters
     ----------
@@ -152,17 +151,17 @@ def prepare(
     settings
         The simulation settings.
     signals
-        Patterns of the signals to record, all if there is none; see `signals.choose`.
+        Patterns of the signals to record, all signals without patterns; see `signals.choose`.
     live
-        Whether it is executed instant by instant, with packets that become available only then.
+        Whether it is executed instant by instant, with packets that arrive in real time.
 
     Raises
     ------
     ApcError
         E870 a continuous equation is not linear and the method is exact, E873 a pattern without a match, E874
         the peers are too many, E893 a peer has no own value as the substitute for a missing packet, E899 a
-        delay is a range, E913 a step that does not fit; and those of `build_schedules`, `build_population`
-        and `routes_of`.
+        delay is a range, E913 a step that does not fit; and the errors of `build_schedules`,
+        `build_population` and `routes_of`.
     """
     topology = system
     refuse_unheard_of(system)
@@ -173,7 +172,7 @@ def prepare(
         choices = _choices(plan, signals)
         members = _members(plan, choices, settings.method, live=live)
         population = build_population(plan.exchange, members, plan.routes)
-    schedule, listed = plan.schedules[0], signals_of(system, choices)
+    schedule, recorded = plan.schedules[0], signals_of(system, choices)
     sample_times = schedule.sample_times[:-1]
     timings, quantum = plan.numbers.timings, schedule.quantum
     return Simulation(
@@ -181,8 +180,8 @@ def prepare(
         topology=topology,
         settings=settings,
         population=population,
-        signals=listed,
-        order=_order(system, population, listed),
+        signals=recorded,
+        order=_order(system, population, recorded),
         forces=tuple(_forces(member) for member in members),
         arrival_processes=tuple(
             arrival_process_of(system, timings, plan.exchange, route, quantum) for route in plan.routes
@@ -204,7 +203,7 @@ def prepare(
 
 
 def check_length(system: Model, duration: Fraction, *, runs: int = 1) -> None:
-    """Refuse a duration that would take too long to simulate.
+    """Raise E915 for a duration that would take too long to simulate.
 
     Parameters
     ----------
@@ -226,15 +225,13 @@ def check_length(system: Model, duration: Fraction, *, runs: int = 1) -> None:
         return
     longest = float(MOST_ROWS * row / runs)
     each = f" in each of {runs:,} runs" if runs > 1 else ""
-    expected = f"at most {longest:.6g} s{each}: a row a tick, {MOST_ROWS:,} in all"
-    got, hint = f"{float(duration):.6g} s", f'--duration "{no_more(longest)} s"'
-    raise ApcError(
-        Diagnostic("E915", SourceLocation(system.origin.topology), "the duration", expected, got, hint)
-    )
+    expected = f"at most {longest:.6g} s{each} ({MOST_ROWS:,} rows, one for each tick)"
+    got, fix = f"{float(duration):.6g} s", f'--duration "{no_more(longest)} s"'
+    raise ApcError(Diagnostic("E915", SourceLocation(system.origin.topology), "duration", expected, got, fix))
 
 
 def size_note(simulation: Simulation, *, decimal: bool) -> str:
-    """Return a note on the size of a file of all rows, "" if it is small.
+    """Return a note on the size of a file of all rows, "" if the size is below LARGE.
 
     Parameters
     ----------
@@ -257,8 +254,9 @@ def size_note(simulation: Simulation, *, decimal: bool) -> str:
 class SimulationPlan:
     """The events of a frame of all peers, before functions are built.
 
-    `subsystems` are the Jacobians of each peer type, `flows` its equations for the method, `schedules` the
-    events of each group's frame; `routes` are the receptions over unreliable links.
+    `subsystems` are the Jacobians of each peer type, `flows` the equations of each peer type that the method
+    integrates, `schedules` the events of each group's frame; `routes` are the receptions over unreliable
+    links. `system` is stamped: if ages are recorded, packets contain their time of sending.
     """
 
     system: Model
@@ -274,8 +272,6 @@ def plan_of(system: Model, method: Method) -> SimulationPlan:
     """Return the simulation plan of a model: its numbers, flows, routes and schedules.
 
     Raises ApcError for a model that cannot be simulated.
-
-    The plan's system is `stamped`: if ages are recorded, packets contain their time of sending.
     """
     system = stamped(system)
     numbers = resolve(system)
@@ -298,7 +294,7 @@ def plan_of(system: Model, method: Method) -> SimulationPlan:
 
 
 def _choices(plan: SimulationPlan, signals: Sequence[str]) -> tuple[SignalSelection, ...]:
-    """Return the recorded signals of each group; refuse more than fits the memory."""
+    """Return the recorded signals of each group; raise an error if they exceed the memory."""
     system = plan.system
     available = [
         local_signals(system.peer_types[group.peer_type], schedule)
@@ -312,51 +308,70 @@ def _choices(plan: SimulationPlan, signals: Sequence[str]) -> tuple[SignalSelect
 def _members(
     plan: SimulationPlan, choices: Sequence[SignalSelection], method: Method, *, live: bool
 ) -> list[GroupProgram]:
-    """Return the groups as members of a population, recorded peers separate from the others."""
+    """Return the members of the population: the recorded peers of each group, then its other peers."""
     system, numbers, flows = plan.system, plan.numbers, plan.flows
     linear = [
         rates(peer_type, flow.rows if flow else ())
         for peer_type, flow in zip(system.peer_types, flows, strict=True)
     ]
-    cuts = instants_within(plan.schedules) if live else exchanges_within(plan.schedules)
+    segment_ends = instants_within(plan.schedules) if live else exchanges_within(plan.schedules)
     programs: dict[Any, Program] = {}
     members = []
     groups = zip(system.groups, plan.schedules, choices, strict=True)
-    for group, (item, schedule, choice) in enumerate(groups):
-        rows, vectors = numbers.rows[group], numbers.parameters[group]
-        moves: Sequence[Floats] | None = None
+    for group, (model_group, schedule, choice) in enumerate(groups):
+        rows, parameter_vectors = numbers.rows[group], numbers.parameters[group]
+        transitions: Sequence[Floats] | None = None
         is_recorded = choice.selected.any(axis=1)
-        for which, recorded in ((is_recorded, choice.locals), (~is_recorded, ())):
-            peers = np.flatnonzero(which)
+        for mask, recorded in ((is_recorded, choice.locals), (~is_recorded, ())):
+            peers = np.flatnonzero(mask)
             if not len(peers):
                 continue
-            key = (item.peer_type, id(schedule), recorded)
-            if key not in programs:
-                programs[key] = build_program(
-                    linear[item.peer_type], schedule, recorded, cuts, flows[item.peer_type]
+            program_key = (model_group.peer_type, id(schedule), recorded)
+            if program_key not in programs:
+                programs[program_key] = build_program(
+                    linear[model_group.peer_type],
+                    schedule,
+                    recorded,
+                    segment_ends,
+                    flows[model_group.peer_type],
                 )
-            if moves is None:  # transitions of a group's subsystems over every interval
-                moves = transition_rows(linear[item.peer_type], vectors, programs[key].seconds)
-                moves = perturbed(moves, 0) if method.perturbed else moves
-            numbered, subsystem = plan.exchange.starts[group] + peers, plan.subsystems[item.peer_type]
+            if transitions is None:  # transitions of a group's subsystems over every interval
+                transitions = transition_rows(
+                    linear[model_group.peer_type], parameter_vectors, programs[program_key].seconds
+                )
+                transitions = perturbed(transitions, 0) if method.perturbed else transitions
+            peer_numbers, subsystem = (
+                plan.exchange.starts[group] + peers,
+                plan.subsystems[model_group.peer_type],
+            )
             members.append(
-                build_member(group, numbered, subsystem, rows[peers], vectors, programs[key], moves)
+                build_member(
+                    group,
+                    peer_numbers,
+                    subsystem,
+                    rows[peers],
+                    parameter_vectors,
+                    programs[program_key],
+                    transitions,
+                )
             )
     return members
 
 
 def _chunk_length(population: Population, duration: Fraction) -> int:
-    """Return the number of frames per block: equal blocks, none larger than necessary."""
+    """Return the number of frames per chunk: chunks of nearly equal length within the limits."""
     frames = int(duration / (population.frame * population.quantum)) + 1
-    pushed = sum(member.program.impulse_rows * len(member.parameters) for member in population.members)
-    observed = sum(route.ticks * len(route.pairs) for route in population.exchange_program.routes)
-    numbers = population.sample_count * population.width + pushed + observed
-    most = max(1, min(MOST_FRAMES, CHUNK // max(1, numbers), frames))
-    return -(-frames // -(-frames // most))
+    impulse_numbers = sum(
+        member.program.impulse_rows * len(member.parameters) for member in population.members
+    )
+    packet_numbers = sum(route.ticks * len(route.pairs) for route in population.exchange_program.routes)
+    numbers = population.sample_count * population.width + impulse_numbers + packet_numbers
+    longest = max(1, min(MOST_FRAMES, CHUNK // max(1, numbers), frames))
+    return -(-frames // -(-frames // longest))
 
 
 def _order(system: Model, population: Population, signals: Sequence[Signal]) -> Integers:
-    """Return the index of each signal in a row of a population."""
+    """Return the index of each signal in a row of the population."""
     starts = np.cumsum([0] + [group.count for group in system.groups])
     column_of = {
         (system.groups[member.group].name, peer, local.name): column + index * member.count + i
@@ -381,48 +396,48 @@ def _check_size(
     schedules: Sequence[Schedule],
     choices: Sequence[SignalSelection] = (),
 ) -> None:
-    """Refuse too many peers, or too many recorded peers, for one frame to fit the memory."""
+    """Raise ApcError E874 if the arrays of one frame, with the recorded signals, exceed the memory."""
     total = sum(
         int(choice.selected.any(axis=1).sum()) * len(choice.locals) * len(schedule.sample_times)
         for choice, schedule in zip(choices, schedules, strict=bool(choices))
     )
     for group, schedule in zip(system.groups, schedules, strict=True):
         peer_type = system.peer_types[group.peer_type]
-        lengths = 2  # of intervals, mostly
-        local = len(peer_type.parameters) + lengths * len(peer_type.states) * (
+        interval_lengths = 2  # most schedules have two, each with its own transition matrix
+        numbers_per_peer = len(peer_type.parameters) + interval_lengths * len(peer_type.states) * (
             len(peer_type.states) + len(peer_type.holds) + 1
         )
-        total += group.count * (local + sum(schedule.depths))
+        total += group.count * (numbers_per_peer + sum(schedule.depths))
     total += NUMBERS_A_PAIR * count_pairs(system, exchange)
-    message = f"{system.peers:,} peers hold {total:,} numbers in a frame, which"
+    message = f"{system.peers:,} peers with {total:,} numbers in a frame"
     refuse_beyond(
         NUMBER * total,
         "E874",
         SourceLocation(system.origin.topology),
         message,
-        "fewer peers, or fewer --signals",
+        "use fewer peers or fewer --signals",
     )
 
 
 def _flow(
     system: Model, numbers: ResolvedNumbers, index: int, subsystem: SubsystemJacobians, method: Method
 ) -> Flow | None:
-    """Return the equations of a peer type that the method integrates, None if none."""
+    """Return the equations of a peer type that the method integrates, None if it integrates no state."""
     peer_type = system.peer_types[index]
     rows = rows_to_move(peer_type, method)
     if not rows:
         return None
-    vectors = [
+    parameter_vectors = [
         vector
-        for group, parameter in zip(system.groups, numbers.parameters, strict=True)
+        for group, vectors_of_group in zip(system.groups, numbers.parameters, strict=True)
         if group.peer_type == index
-        for vector in parameter
+        for vector in vectors_of_group
     ]
-    return flow_of(peer_type, method, rows, state_scales(system, peer_type, subsystem, vectors))
+    return flow_of(peer_type, method, rows, state_scales(system, peer_type, subsystem, parameter_vectors))
 
 
 def _tolerances(system: Model, flows: Sequence[Flow | None]) -> tuple[Tolerance, ...]:
-    """Return the tolerances of all states, each state of several peer types once, with the smallest."""
+    """Return the tolerances of all integrated states; a state of several peer types has the smallest."""
     result: dict[str, Tolerance] = {}
     for peer_type, flow in zip(system.peer_types, flows, strict=True):
         for tolerance in flow.tolerances(peer_type) if flow else ():
@@ -434,6 +449,7 @@ def _tolerances(system: Model, flows: Sequence[Flow | None]) -> tuple[Tolerance,
 def _check_step(
     system: Model, numbers: ResolvedNumbers, schedules: Sequence[Schedule], method: Method
 ) -> None:
+    """Raise an error for a fixed step that is longer than the fastest clock's period, or far too short."""
     fastest = min((numbers.timings[clock.period] for clock in system.clocks), default=ROW)
     lengths = [
         event.duration * schedule.quantum
@@ -445,7 +461,7 @@ def _check_step(
 
 
 def _forces(member: GroupProgram) -> tuple[SubsystemForcing, ...]:
-    """Return the forces that change with time on each different subsystem of a group; none if none does."""
+    """Return the time-varying forces on each different subsystem of a member; empty without forces."""
     program = member.program
     if not program.impulse_rows:
         return ()

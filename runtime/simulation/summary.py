@@ -1,12 +1,12 @@
 """Summary of a simulated motion: verdict, settling time, frequency, extremes.
 
-Takes: the rows of a simulation, as they come. Gives: `SummaryAccumulator`, `Summary`, `SignalRange`,
-`Broken`; `agreed`.
+Takes: the rows of a simulation, block by block. Gives: `SummaryAccumulator`, `Summary`, `SignalRange`,
+`Broken`; `checked_by_analysis`.
 Guarantees: the memory used does not grow with the duration.
-Does not: prove anything: a verdict holds for the duration that was simulated (see `analysis` for proof).
+Does not: prove anything: a verdict holds for the simulated duration (see `analysis` for proofs).
 
-The verdict is one of these. The rates are those of `decay.fit_motion`, of the last half of the motion that is
-visible.
+The verdict is one of the following. The rates are those of `decay.fit_motion` over the last half of the
+visible motion.
 
     at rest         no position changes
     decays          the slowest exponential decays, its error included, or every position has settled
@@ -23,13 +23,13 @@ An angle is a position, too.
 
 Without forces that change with time the verdict of a linear topology is consistent with that of `analyze`:
 where the two contradict each other (a mode that the motion does not excite, a duration too short) it is "not
-determined" (see `agreed`).
+determined" (see `checked_by_analysis`).
 
-The work a coupler does is ∫ −f v dt over the forces it holds, f the flow into the coupler at each of its
-flanges and v that flange's velocity: exact, as f is constant between events. Positive work feeds the motion.
+The work of a coupler is ∫ −f v dt over its held forces, f the force on the coupler at each of its flanges and
+v the velocity of the flange: exact, as f is constant between events. Positive work adds energy to the motion.
 
-A limit is of a device's force and reach, and of whatever else declares one; it is evaluated in every row of
-what is recorded. To keep a motion within it is for equations (`limits: on` of a device).
+Limits are those of a device's force and workspace, and other declared limits; they are evaluated in every row
+of the recorded signals. Equations can enforce them (`limits: on` of a device).
 """
 
 from __future__ import annotations
@@ -44,7 +44,8 @@ from numpy.typing import NDArray
 from apc.analysis.analysis import Analysis, analyze
 from apc.compiler.compiled import ANGLES, LENGTH, Group, Model
 from apc.compiler.errors import ApcError
-from apc.frame.jacobians import jacobians
+from apc.lifting.numeric_model import numeric_model
+from apc.linearization.jacobians import jacobians
 from apc.network.nominal_criterion import unreliable
 from apc.simulation.decay import Fit, fit_motion
 from apc.simulation.driven import driven_until
@@ -56,24 +57,24 @@ from apc.verdict import StabilityVerdict
 
 Floats = NDArray[np.float64]
 
-BAND = 0.05  # of the range: the 5 % of control engineering's settling time
-LATE = 0.9  # of the duration: a settling time after that may be of the duration, not of the motion
-LEAST_STEP = 0.2  # of the range: a smaller difference from first to last value is no step to overshoot
+BAND = 0.05  # of the range: the 5 % settling time of control engineering
+LATE = 0.9  # of the duration: a later settling time is not reported, as the motion may not be settled
+LEAST_STEP = 0.2  # of the range: least difference from first to last value for an overshoot
 POSITIONS = (LENGTH, *ANGLES)  # the units that decide the verdict
-ROUNDING = 1e-9  # of the largest range of its unit: a position that moves by less has no settling time
-MOST_EXTREMES = 2**22  # numbers kept for each of three tables: 32 MiB
-FEWEST_GROUPS = 16  # of rows whose extremes are kept together, whatever their number
-MOST_FITTED = 1024  # positions whose last rows are kept for a fit
-SHORT = "the duration is too short, or the motion too irregular, for a decay rate"
-CONTRADICTION = "the motion within this duration does not show the verdict of the linear topology"
-MOST_LINEAR = 60  # peers of a linear topology that is analyzed together with a motion
+ROUNDING = 1e-9  # of the largest range in its unit: a position of smaller range has no settling time
+MOST_EXTREMES = 2**22  # numbers stored in each of three tables: 32 MiB
+FEWEST_GROUPS = 16  # least number of groups of rows, each with common extremes
+MOST_FITTED = 1024  # positions whose last rows are stored for a fit
+SHORT = "the duration is too short, or the motion too irregular, to fit a decay rate"
+CONTRADICTION = "the motion within this duration differs from the verdict of the linear topology"
+MOST_LINEAR = 60  # peers of a linear model up to which the verdict is compared with an analysis
 
 
 @dataclass(frozen=True, slots=True)
 class Broken:
-    """A limit that was broken: the `signal`, its `limit` by name and `value`, in SI, with its `unit`.
+    """An exceeded limit: `signal`, name of the `limit` and its `value` in SI, with the `unit`.
 
-    It is beyond it from `first_s` seconds on; its largest size is `most`, at `at_s` seconds.
+    `first_s` is the first instant above the limit in seconds; `most` is the largest magnitude, at `at_s`.
     """
 
     signal: str
@@ -87,7 +88,10 @@ class Broken:
 
 @dataclass(frozen=True, slots=True)
 class SignalRange:
-    """First, last, lowest and highest value of a signal in SI; `settled` is its settling time or None."""
+    """First, last, lowest and highest value of a signal in SI.
+
+    `settled` is its settling time in s or None.
+    """
 
     name: str
     unit: str
@@ -102,12 +106,12 @@ class SignalRange:
 class Summary:
     """A summary of a simulation, in SI units.
 
-    `verdict` is one of those above; `reason` is why it is not determined. `settled` is the settling time in
-    s, at most `settled_error` too large. `fit` is that of the last part of the motion, `oscillating` the name
-    of the position of its oscillation. `driven_until` is the last time in s at which an equation changed with
-    time alone. `overshoot` is a part of the step from first to last. `copies` are (name, distance at the end)
-    of states sent unchanged. `work` is (part, J). `broken` are the exceeded limits of recorded signals, in
-    order of time. `unrecorded` positions of the model were not evaluated.
+    `verdict` is one of those above; `reason` is given if it is not determined. `settled` is the settling time
+    in s, at most `settled_error` too large. `fit` is that of the last part of the motion, `oscillating` the
+    name of the oscillating position. `driven_until` is the last time in s at which an equation changed with
+    time alone. `overshoot` is relative to the step from first to last value. `copies` are (name, distance at
+    the end) of states sent unchanged. `work` is (part, J). `broken` are the exceeded limits of recorded
+    signals, in order of time. `unrecorded` is the number of positions that were not recorded.
     """
 
     verdict: MotionVerdict
@@ -132,17 +136,17 @@ class Summary:
 
 
 class SummaryAccumulator:
-    """Evaluates a simulation's rows as they pass and keeps extremes, group by group of rows."""
+    """Evaluates the rows of a simulation block by block, storing extremes over groups of rows."""
 
     def __init__(self, simulation: Simulation, until: float | None = None) -> None:
-        """Initialize before the first simulated row.
+        """Set up the tables before the first row.
 
         Parameters
         ----------
         simulation
             The simulation.
         until
-            Its `driven_until`, if that is known already.
+            The result of `driven_until`, if it is already computed.
         """
         self.simulation, self.signals = simulation, simulation.signals
         self.until = driven_until(simulation) if until is None else until
@@ -165,7 +169,7 @@ class SummaryAccumulator:
         self.rows = 0
 
     def take(self, time: Floats, values: Floats) -> None:
-        """Evaluate some rows: `time` (rows,), `values` (rows, signals)."""
+        """Update the extremes by some rows: `time` (rows,), `values` (rows, signals)."""
         if not len(time):
             return
         if not self.rows:
@@ -176,60 +180,66 @@ class SummaryAccumulator:
         self.samples[index] = values[-len(self.samples) :, self.fitted]
         self.instants[index] = time[-len(self.samples) :]
         self.rows += len(time)
-        touched, starts = np.unique(group, return_index=True)
-        self.low[touched] = np.minimum(self.low[touched], np.minimum.reduceat(values, starts))
-        self.high[touched] = np.maximum(self.high[touched], np.maximum.reduceat(values, starts))
+        groups, starts = np.unique(group, return_index=True)
+        self.low[groups] = np.minimum(self.low[groups], np.minimum.reduceat(values, starts))
+        self.high[groups] = np.maximum(self.high[groups], np.maximum.reduceat(values, starts))
         self.ends[group] = time
-        watched = np.array([*self.forces, *(column for column, _, _ in self.limits)], np.int64)
-        size = np.abs(values[:, watched])
+        columns = np.array([*self.forces, *(column for column, _, _ in self.limits)], np.int64)
+        size = np.abs(values[:, columns])
         largest = size.max(axis=0)
-        grown = largest > self.peak[watched]
-        self.peak[watched[grown]] = largest[grown]
-        self.peak_at[watched[grown]] = time[size.argmax(axis=0)[grown]]
-        over = size[:, len(self.forces) :] > [bound for _, _, bound in self.limits]
-        began = over.any(axis=0) & np.isnan(self.beyond)
-        self.beyond[began] = time[over.argmax(axis=0)[began]]
+        increased = largest > self.peak[columns]
+        self.peak[columns[increased]] = largest[increased]
+        self.peak_at[columns[increased]] = time[size.argmax(axis=0)[increased]]
+        exceeds = size[:, len(self.forces) :] > [bound for _, _, bound in self.limits]
+        first_exceeded = exceeds.any(axis=0) & np.isnan(self.beyond)
+        self.beyond[first_exceeded] = time[exceeds.argmax(axis=0)[first_exceeded]]
 
     def summary(self, block: OutputBlock) -> Summary:
-        """Return the summary of the rows; `block` is the last."""
+        """Return the summary of all rows; `block` is the last block."""
         assert self.rows, "a simulation has a row at time 0"
-        number = (self.rows - 1) // self.width + 1
-        low, high, ends = self.low[:number], self.high[:number], self.ends[:number]
-        with np.errstate(over="ignore", invalid="ignore"):  # of what has diverged
+        group_count = (self.rows - 1) // self.width + 1
+        low, high, ends = self.low[:group_count], self.high[:group_count], self.ends[:group_count]
+        with np.errstate(over="ignore", invalid="ignore"):  # of a diverged motion
             settled = self._settled(low, high, ends)
             fit = self._fit(high.max(axis=0) - low.min(axis=0), float(ends[-1]))
         signals = self.signals
-        numbers = np.stack([self.first, self.last, low.min(axis=0), high.max(axis=0)], axis=1).tolist()
+        end_values = np.stack([self.first, self.last, low.min(axis=0), high.max(axis=0)], axis=1).tolist()
         extents = tuple(
             SignalRange(
-                signal.name, signal.unit, first, last, least, most, None if np.isnan(since) else since
+                signal.name,
+                signal.unit,
+                first,
+                last,
+                least,
+                most,
+                None if np.isnan(settling_time) else settling_time,
             )
-            for signal, since, (first, last, least, most) in zip(
-                signals, settled.tolist(), numbers, strict=True
+            for signal, settling_time, (first, last, least, most) in zip(
+                signals, settled.tolist(), end_values, strict=True
             )
         )
-        moved = [extents[i] for i in self.positions]
-        all_settled = bool(moved) and not np.isnan(settled[self.positions]).any()
-        verdict, reason = self._verdict(block, moved, fit, float(ends[-1]), settled=all_settled)
+        position_ranges = [extents[i] for i in self.positions]
+        all_settled = bool(position_ranges) and not np.isnan(settled[self.positions]).any()
+        verdict, reason = self._verdict(block, position_ranges, fit, float(ends[-1]), settled=all_settled)
         all_settled &= verdict not in (MotionVerdict.AT_REST, MotionVerdict.DIVERGES, MotionVerdict.DRIVEN)
         largest = max(self.forces, key=lambda i: float(self.peak[i]), default=-1)
         work = tuple(zip(self.simulation.population.parts, block.work.tolist(), strict=True))
         force = None
         if largest >= 0:
             force = signals[largest].name, float(self.peak[largest]), float(self.peak_at[largest])
-        row = float(ends[-1] - ends[-2]) / self.width if number > 2 and self.width > 1 else 0.0
+        row_period = float(ends[-1] - ends[-2]) / self.width if group_count > 2 and self.width > 1 else 0.0
         oscillating = signals[self.fitted[fit.oscillation.index]].name if fit and fit.oscillation else ""
         return Summary(
             verdict=verdict,
             reason=reason,
             settled=float(settled[self.positions].max()) if all_settled else None,
-            settled_error=row * (self.width - 1),
+            settled_error=row_period * (self.width - 1),
             fit=fit,
             oscillating=oscillating,
             driven_until=self.until,
             stopped=block.stopped,
             stopped_at=block.stopped_at if block.stopped else None,
-            overshoot=_overshoot(moved) if all_settled else None,
+            overshoot=_overshoot(position_ranges) if all_settled else None,
             largest_force=force,
             copies=self._copies(),
             # The work of an unbounded motion is meaningless.
@@ -239,20 +249,26 @@ class SummaryAccumulator:
             end=float(ends[-1]),
             extents=extents,
             broken=self._broken(),
-            unrecorded=_positions(self.simulation.system) - len(self.positions),
+            unrecorded=_position_count(self.simulation.system) - len(self.positions),
         )
 
     def _verdict(
-        self, block: OutputBlock, moved: Sequence[SignalRange], fit: Fit | None, end: float, *, settled: bool
+        self,
+        block: OutputBlock,
+        position_ranges: Sequence[SignalRange],
+        fit: Fit | None,
+        end: float,
+        *,
+        settled: bool,
     ) -> tuple[MotionVerdict, str]:
-        """Return the verdict, and why it is not determined."""
+        """Return the verdict, and the reason if it is not determined."""
         if block.stopped:
             return MotionVerdict.DIVERGES, ""
-        if not moved:
+        if not position_ranges:
             return MotionVerdict.NOT_DETERMINED, "no position was recorded"
         if self.until > LATE * end:
             return MotionVerdict.DRIVEN, ""
-        if all(extent.low == extent.high for extent in moved):
+        if all(extent.low == extent.high for extent in position_ranges):
             return MotionVerdict.AT_REST, ""
         if fit is None:
             return (MotionVerdict.DECAYS, "") if settled else (MotionVerdict.NOT_DETERMINED, SHORT)
@@ -267,7 +283,7 @@ class SummaryAccumulator:
         return MotionVerdict.NOT_DETERMINED, SHORT
 
     def _settled(self, low: Floats, high: Floats, ends: Floats) -> Floats:
-        """Return the settling time of each signal; NaN if that is too near to the end."""
+        """Return the settling time of each signal in s, NaN if it is later than LATE of the duration."""
         span = high.max(axis=0) - low.min(axis=0)
         units = np.array([signal.unit for signal in self.signals])
         least = np.zeros(len(span))
@@ -275,12 +291,12 @@ class SummaryAccumulator:
             least[units == unit] = ROUNDING * span[units == unit].max()
         band = np.where(span > least, BAND * span, np.inf)
         outside = (high - self.last > band) | (self.last - low > band)
-        after = np.where(outside.any(axis=0), len(outside) - outside[::-1].argmax(axis=0), 0)
-        since = np.append(0.0, ends)[after]
-        return np.where(since <= LATE * ends[-1], since, np.nan)
+        first_settled_group = np.where(outside.any(axis=0), len(outside) - outside[::-1].argmax(axis=0), 0)
+        settling_times = np.append(0.0, ends)[first_settled_group]
+        return np.where(settling_times <= LATE * ends[-1], settling_times, np.nan)
 
     def _fit(self, span: Floats, end: float) -> Fit | None:
-        """Return the fit of the rows kept after the last change with time, None where there is none."""
+        """Return the fit of the stored rows after `until`, None without rows or positions."""
         stored = np.arange(max(self.rows - len(self.samples), 0), self.rows) % len(self.samples)
         stored = stored[self.instants[stored] >= self.until]
         if len(stored) < 2 or not self.fitted:
@@ -307,7 +323,7 @@ class SummaryAccumulator:
         return tuple(copies)
 
     def _broken(self) -> tuple[Broken, ...]:
-        """Return the limits that were broken, the first of them first."""
+        """Return the exceeded limits, in order of time."""
         broken = [
             Broken(
                 self.signals[column].name,
@@ -325,7 +341,10 @@ class SummaryAccumulator:
 
 
 def _limits(system: Model, signals: Sequence[Signal]) -> list[tuple[int, str, float]]:
-    """Return the columns of signals that have a limit, its name and its value, those of each peer its own."""
+    """Return the column, the name and the value of each signal's limit.
+
+    Values may differ from peer to peer.
+    """
     groups = {group.name: group for group in system.groups}
     common = {parameter.name: parameter.value for parameter in system.parameters}
     limits = {
@@ -334,29 +353,29 @@ def _limits(system: Model, signals: Sequence[Signal]) -> list[tuple[int, str, fl
         for limit in system.peer_types[group.peer_type].limits
     }
     return [
-        (column, name, _number(groups[signal.group], signal.peer, name, common))
+        (column, name, _parameter_of_peer(groups[signal.group], signal.peer, name, common))
         for column, signal in enumerate(signals)
         if (name := limits.get((signal.group, signal.local))) is not None
     ]
 
 
-def _number(group: Group, peer: int, name: str, common: dict[str, float]) -> float:
-    """Return a number of one peer, counted from 1: its own, its group's, or that of all."""
+def _parameter_of_peer(group: Group, peer: int, name: str, common: dict[str, float]) -> float:
+    """Return a parameter's value at one peer, counted from 1: of the peer, of its group, or of the model."""
     for column in group.columns:
         if column.name == name:
             return float(column.values[peer - 1])
     return next((value.value for value in group.values if value.name == name), common[name])
 
 
-def agreed(summary: Summary, system: Model) -> Summary:
-    """Return the summary of a motion, not determined where it contradicts the analysis of a linear topology.
+def checked_by_analysis(summary: Summary, system: Model) -> Summary:
+    """Return a summary whose verdict is "not determined" if it contradicts the analysis of a linear model.
 
     Parameters
     ----------
     summary
-        That of a motion by exact transitions.
+        The summary of a motion by exact transitions.
     system
-        The topology that was simulated.
+        The simulated model.
     """
     driven = summary.verdict is MotionVerdict.DRIVEN
     if (
@@ -368,7 +387,7 @@ def agreed(summary: Summary, system: Model) -> Summary:
     if not all(jacobians(peer_type).affine for peer_type in system.peer_types) or unreliable(system):
         return summary
     try:
-        analysis = analyze(system)
+        analysis = analyze(numeric_model(system))
     except ApcError:  # models that cannot be analyzed can be simulated
         return summary
     if driven:
@@ -376,13 +395,13 @@ def agreed(summary: Summary, system: Model) -> Summary:
             return summary
         reason = f"driven; apc analyze: {analysis.verdict}{_time_constant(analysis)}"
         return replace(summary, verdict=MotionVerdict.DIVERGES, reason=reason)
-    decays, lasts = (
+    decays, decays_or_drifts = (
         summary.verdict is MotionVerdict.DECAYS,
         summary.verdict in (MotionVerdict.DECAYS, MotionVerdict.DRIFTS),
     )
     drifts = analysis.verdict is StabilityVerdict.DRIFTS
     contradicted = {
-        True: not lasts
+        True: not decays_or_drifts
         or (summary.verdict is MotionVerdict.DRIFTS and analysis.verdict is StabilityVerdict.STABLE),
         False: decays or (summary.verdict is not MotionVerdict.DIVERGES and not drifts),
         None: False,
@@ -394,7 +413,7 @@ def agreed(summary: Summary, system: Model) -> Summary:
 
 
 def _time_constant(analysis: Analysis) -> str:
-    """Return the time constant of the slowest decay or fastest growth in words, "" where there is none."""
+    """Return the time constant of the slowest decay or fastest growth as text, "" if there is none."""
     if not 0 < analysis.spectral_radius != 1:
         return ""
     slowest = analysis.frame_s / abs(math.log(analysis.spectral_radius))
@@ -402,22 +421,25 @@ def _time_constant(analysis: Analysis) -> str:
 
 
 def is_position(signal: Signal) -> bool:
-    """Return whether a signal is a position, which decides the verdict."""
+    """Return whether a signal is a position: the verdict depends on positions only."""
     return signal.role == "state" and signal.unit in POSITIONS
 
 
-def _positions(system: Model) -> int:
-    """Return the number of positions in a model."""
-    each = [sum(state.unit in POSITIONS for state in peer_type.states) for peer_type in system.peer_types]
-    return sum(group.count * each[group.peer_type] for group in system.groups)
+def _position_count(system: Model) -> int:
+    """Return the number of positions in a model, over all peers."""
+    per_type = [sum(state.unit in POSITIONS for state in peer_type.states) for peer_type in system.peer_types]
+    return sum(group.count * per_type[group.peer_type] for group in system.groups)
 
 
 def _overshoot(extents: Sequence[SignalRange]) -> tuple[str, float] | None:
-    """Return the largest excess over the last value, as a part of the step from the first."""
-    beyonds = []
+    """Return the position with the largest overshoot, relative to the step from first to last value.
+
+    It is None if no position has a sufficient step.
+    """
+    overshoots = []
     for extent in extents:
         step = extent.last - extent.first
         if step and abs(step) > LEAST_STEP * (extent.high - extent.low):
-            beyond = extent.high - extent.last if step > 0 else extent.last - extent.low
-            beyonds.append((extent.name, beyond / abs(step)))
-    return max(beyonds, key=lambda pair: pair[1], default=None)
+            excess = extent.high - extent.last if step > 0 else extent.last - extent.low
+            overshoots.append((extent.name, excess / abs(step)))
+    return max(overshoots, key=lambda pair: pair[1], default=None)

@@ -1,9 +1,9 @@
 """The result of a simulation for the user: rows, columns with names and units, and provenance.
 
 Takes: a `Simulation`. Gives: `simulate`, `run_simulation`; `Trajectory`, `trajectory_of`, `SimulationReport`,
-`Provenance`, `provenance_of`; `Sink`, `Keeper`, where rows are stored; `parse_duration`, `duration_of`,
+`Provenance`, `provenance_of`; `Sink`, `Keeper`, consumers of rows; `parse_duration`, `duration_of`,
 `parameters_of`, `texts_of`.
-Guarantees: no number is NaN or infinite; a diverging simulation is kept up to the last finite row, and
+Guarantees: no number is NaN or infinite; a diverging simulation is stored up to the last finite row, and
 reported.
 Does not: write files, or draw (see `output`).
 """
@@ -22,9 +22,6 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.timings import part
-from apc.distribution import versions
-from apc.memory import refuse_beyond
-from apc.option_value import option_value
 from apc.result import PlotStyle, Result
 from apc.simulation.accuracy import ErrorEstimate, compare_with
 from apc.simulation.flow import Tolerance
@@ -32,17 +29,23 @@ from apc.simulation.output_blocks import OutputBlock, blocks
 from apc.simulation.settings import DEFAULT, EXACT, WHERE_NEEDED, Method, Settings
 from apc.simulation.signals import Signal
 from apc.simulation.simulation import Simulation, check_length, prepare
-from apc.simulation.summary import Summary, SummaryAccumulator, agreed
+from apc.simulation.summary import Summary, SummaryAccumulator, checked_by_analysis
+from apc.support.distribution import versions
+from apc.support.memory import refuse_beyond
+from apc.support.option_value import option_value
 
 Floats = NDArray[np.float64]
 
-NUMBER = 16  # bytes of a number that is kept: in its block, and in the rows put together
-MOST_LISTED = 1000  # peers whose own numbers are written out; the digest of their table covers the others
+NUMBER = 16  # bytes of memory for a stored number: in its block, and in the joined rows
+MOST_LISTED = 1000  # peers whose own parameters are listed; the digest of their table covers the others
 
 
 @dataclass(frozen=True, slots=True)
 class Provenance:
-    """The origin of a result: `texts` is the SHA-256 of all texts, `parameters` (name, SI, unit)."""
+    """The origin of a result: topology, method, seed, parameters and versions.
+
+    `texts` is the SHA-256 of all texts of the model; `parameters` are (name, value in SI, unit).
+    """
 
     topology: str
     texts: str
@@ -55,15 +58,15 @@ class Provenance:
 
     @property
     def versions(self) -> tuple[tuple[str, str], ...]:
-        """The versions of the program and its libraries: determined when a result is written."""
+        """The versions of the program and its libraries, read when a result is written."""
         return versions("casadi", "numpy")
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class SimulationReport(Result):
-    """The summary of a run without its rows; `interrupted` is whether it ended early.
+    """The summary of a run without its rows; `interrupted` states that the run ended early.
 
-    `error` is present on request.
+    `error` is the error estimate, None if it was not requested.
     """
 
     shown_by = "simulation_output:simulation"
@@ -77,9 +80,10 @@ class SimulationReport(Result):
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Trajectory(SimulationReport):
-    """Rows over time: `time` (rows,) in seconds, `values` (rows, signals) in SI, a column a signal.
+    """The rows of a simulation: `time` (rows,) in seconds, `values` (rows, signals) in SI, one column per
+    signal.
 
-    A row holds what was before the tick at its time.
+    A row contains the values just before the tick at its time.
     """
 
     time: Floats
@@ -87,23 +91,22 @@ class Trajectory(SimulationReport):
     signals: tuple[Signal, ...]
 
     def __getitem__(self, name: str) -> Floats:
-        """Return the column of a signal (rows,). Raises KeyError if there is none of that name."""
+        """Return the column of a signal (rows,); KeyError if no signal has this name."""
         for index, signal in enumerate(self.signals):
             if signal.name == name:
                 return self.values[:, index]
         raise KeyError(name)
 
     def to_dataframe(self) -> Any:
-        """Return a pandas DataFrame: index `time [s]`, a column a signal, headings with units."""
+        """Return a pandas DataFrame: index `time [s]`, one column per signal, headings with units."""
         return self._shown("table")
 
     def to_xarray(self) -> Any:
-        """Return an xarray Dataset over `time`, a variable a signal with its unit as attribute."""
+        """Return an xarray Dataset over `time`, one variable per signal with its unit as attribute."""
         return self._shown("dataset")
 
     def plot(self, ax: Any = None, **style: Unpack[PlotStyle]) -> Any:
-        """Plot a panel per quantity, or all signals into one Axes, in the style `reduction`; return the
-        Figure.
+        """Return a Figure with one panel per quantity, or all signals in one Axes, in the style `look`.
 
         Parameters
         ----------
@@ -129,7 +132,7 @@ def provenance_of(simulation: Simulation) -> Provenance:
 
 
 def parameters_of(system: Model) -> tuple[tuple[str, float, str], ...]:
-    """Return the parameters of a model, its groups and peers: name, value in SI, unit."""
+    """Return the parameters of a model, its groups and its peers: name, value in SI, unit."""
     parameters = [(parameter.name, parameter.value, parameter.unit) for parameter in system.parameters]
     for group in system.groups:
         parameters += [(f"{group.name}.{value.name}", value.value, value.unit) for value in group.values]
@@ -153,25 +156,25 @@ class Sink(Protocol):
     """A consumer of the blocks of a simulation."""
 
     def take(self, block: OutputBlock) -> None:
-        """Take one block."""
+        """Process one block of rows."""
 
 
 class Keeper:
-    """Keeps the rows in memory."""
+    """A sink that stores all rows in memory."""
 
     def __init__(self, simulation: Simulation) -> None:
         numbers = simulation.rows * len(simulation.signals)
         message = f"{len(simulation.signals):,} signals over {float(simulation.settings.duration):g} s"
-        hint = "fewer --signals, a shorter --duration, or --out FILE.parquet alone"
+        advice = "use fewer --signals, a shorter --duration, or --out FILE.parquet alone"
         refuse_beyond(
-            NUMBER * numbers, "E876", SourceLocation(simulation.system.origin.topology), message, hint
+            NUMBER * numbers, "E876", SourceLocation(simulation.system.origin.topology), message, advice
         )
         self.signals = len(simulation.signals)
         self.time: list[Floats] = []
         self.values: list[Floats] = []
 
     def take(self, block: OutputBlock) -> None:
-        """Keep one block."""
+        """Store one block of rows."""
         self.time.append(block.time)
         self.values.append(block.values)
 
@@ -180,7 +183,7 @@ class Keeper:
 def run_simulation(
     simulation: Simulation, sinks: Sequence[Sink], *, progress: Callable[[float], None] | None = None
 ) -> tuple[Summary, bool]:
-    """Run a simulation into sinks; return its summary, and whether Ctrl-C ended it early.
+    """Return the summary of a simulation run into sinks, and whether Ctrl-C ended the run early.
 
     Parameters
     ----------
@@ -191,21 +194,21 @@ def run_simulation(
     progress
         Called with the simulated time, in seconds, after each block.
     """
-    watch, interrupted = SummaryAccumulator(simulation), False
+    accumulator, interrupted = SummaryAccumulator(simulation), False
     try:
         for block in blocks(simulation):
-            watch.take(block.time, block.values)
+            accumulator.take(block.time, block.values)
             for sink in sinks:
                 sink.take(block)
             if progress is not None and len(block.time):
                 progress(float(block.time[-1]))
     except KeyboardInterrupt:
-        if not watch.rows:
+        if not accumulator.rows:
             raise
         interrupted = True
-    summary = watch.summary(block)
+    summary = accumulator.summary(block)
     if simulation.settings.method.name in (EXACT, WHERE_NEEDED):
-        summary = agreed(summary, simulation.topology)
+        summary = checked_by_analysis(summary, simulation.topology)
     return summary, interrupted
 
 
@@ -219,18 +222,18 @@ def simulate(
     method: Method = DEFAULT,
     error: bool = False,
 ) -> Trajectory:
-    """Simulate a model in time and store its rows.
+    """Return the rows of a simulation of a model in time.
 
     Parameters
     ----------
     system
         The model.
     duration
-        In seconds; that of the model's experiment if not given.
+        The duration in seconds; by default that of the model's experiment.
     signals
-        Patterns of the signals to keep, all if there is none; see `signals.choose`.
+        Patterns of the signals to store, all signals without patterns; see `signals.choose`.
     jit
-        Whether to compile to machine code where there is a C compiler.
+        Whether to compile to machine code if a C compiler exists.
     seed
         The seed of the random numbers; by default the experiment's.
     method
@@ -241,7 +244,7 @@ def simulate(
     Raises
     ------
     ApcError
-        E877 no duration is known, E876 too many numbers to keep; and those of `simulation.prepare`.
+        E877 no duration is given, E876 too many numbers to store; and the errors of `simulation.prepare`.
     """
     settings = Settings(duration_of(system, duration), method, seed, jit)
     simulation = prepare(system, settings, signals=signals)
@@ -259,7 +262,7 @@ def trajectory_of(
     interrupted: bool,
     error: ErrorEstimate | None = None,
 ) -> Trajectory:
-    """Return the stored rows as a trajectory.
+    """Return the stored rows of a simulation as a trajectory.
 
     Parameters
     ----------
@@ -268,7 +271,7 @@ def trajectory_of(
     keeper
         The stored rows.
     summary, interrupted
-        As `run_simulation` returns them.
+        The results of `run_simulation`.
     error
         The error estimate, if any.
     """
@@ -285,12 +288,12 @@ def trajectory_of(
 
 
 def parse_duration(text: str) -> Fraction:
-    """Read a duration such as "2 s". Raises ApcError if it is none."""
+    """Return the duration of a text such as "2 s", in seconds; ApcError if the text is no duration."""
     return option_value("--duration", text, subject="duration", unit="s")
 
 
 def duration_of(system: Model, duration: Fraction | None, *, runs: int = 1) -> Fraction:
-    """Return the simulated duration: the given one, or that of the experiment.
+    """Return the simulated duration in seconds: the given duration, or that of the experiment.
 
     Parameters
     ----------
@@ -308,15 +311,13 @@ def duration_of(system: Model, duration: Fraction | None, *, runs: int = 1) -> F
     """
     number = system.experiment.duration if duration is None else duration
     if number is None:
-        message = "the topology says no duration"
-        hint = 'experiment: {duration: 3 s}  (or --duration "3 s")'
-        raise ApcError(Diagnostic("E877", SourceLocation(system.origin.topology), message, hint=hint))
+        message = "the topology has no duration"
+        fix = 'experiment: {duration: 3 s}, or --duration "3 s"'
+        raise ApcError(Diagnostic("E877", SourceLocation(system.origin.topology), message, fix=fix))
     if number <= 0:
         expected, got = "more than 0 s", f"{float(number):g} s"
         raise ApcError(
-            Diagnostic(
-                "E877", SourceLocation(system.origin.topology), "the duration", expected=expected, got=got
-            )
+            Diagnostic("E877", SourceLocation(system.origin.topology), "duration", expected=expected, got=got)
         )
     check_length(system, number, runs=runs)
     return number

@@ -26,39 +26,37 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.analysis.analysis import analyze, near_start
-from apc.analysis.robust_stability import UNDECIDED, ChangingDelay, RobustStability
+from apc.analysis.box_result import UNDECIDED, ChangingDelay, RobustStability
 from apc.analysis_report import proved_at
 from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError, Diagnostic
 from apc.compiler.timings import part
-from apc.frame.evaluation_errors import finite_equations
-from apc.frame.numeric_model import prepare
-from apc.frame.overrides import Override, apply
-from apc.frame.parameter_names import ParameterRef, Range, value_now
 from apc.haptics.absolute_stability import absolute_stability
-from apc.mean_square.time_varying_delay import loop_gain
+from apc.lifting.numeric_model import numeric_model
+from apc.linearization.evaluation_errors import finite_equations
 from apc.network.nominal_criterion import limitations
-from apc.not_supported import NotSupportedError
-from apc.parameter_studies.crossing import Progress
-from apc.parameter_studies.delay_interval_proof import changing
-from apc.parameter_studies.stability_criteria import MEAN_SQUARE, NOMINAL, PASSIVE
+from apc.parameter_values.overrides import Override, apply
+from apc.parameter_values.parameter_names import ParameterRef, Range, value_now
 from apc.result import Result
-from apc.threads import single_threaded
+from apc.studies.crossing import Progress
+from apc.studies.stability_criteria import MEAN_SQUARE, NOMINAL, PASSIVE
+from apc.support.extension_table import find_extension, require_extension
+from apc.support.not_supported import NotSupportedError
+from apc.support.threads import single_threaded
 from apc.tuning.constraints import BEYOND, RESPONSES, ConstraintSet, Scenario, transparency_in
-from apc.tuning.optimality_bound import none_better
 from apc.tuning.scenario_optimizer import BINDS, Optimum, ScenarioOptimizer
 from apc.tuning.specification import CHANGING, CONSTRAINT, HINF, LOCATION, TransparencyMetric, TuningSpec
 
 Floats = NDArray[np.float64]
 
-# Significant digits that a person types.
+# The largest number of significant digits of printed gains.
 DIGITS = 4
 
-# The relative worsening allowed for rounding a constraint beyond its minimum.
+# The relative increase of the minimized constraint that rounding may cause.
 NEARLY = 1e-4
 
-# Steps by which the objective is relaxed until the gains are proved, as shares of the optimum. With a box the
-# first step is larger: near a constraint, the cells are small and very numerous.
+# The relaxations of the objective until the gains are proved, as shares of the optimum. With a box the first
+# relaxation is larger: near an active constraint, a proof needs many small cells.
 BACK = (0.0, 1e-4, 1e-3, 1e-2)
 BACK_IN_BOX = (5e-3, 1e-2)
 
@@ -66,40 +64,38 @@ BACK_IN_BOX = (5e-3, 1e-2)
 SLACK = 1e-5
 
 # The text if only stability is proved.
-SLOWER = "stable is proved; how fast motions die out, or what is felt, is only looked at scenario by scenario"
+SLOWER = "stability is proved; decay and metrics are evaluated for each scenario only"
 
 # Text for the demand of every passive hand in a box.
-POINTWISE = "no box is proved with every passive hand: it is so in the scenarios looked at"
+POINTWISE = "no box is proved with passive hands; the scenarios were evaluated"
 
 # The texts for a time-varying delay without proof, and for one with a box.
-CHANGES = "with a delay that changes from packet to packet it is not proved stable"
-CHANGES_IN_BOX = "no box is proved with a delay that changes: it is so in the scenarios evaluated"
+CHANGES = "not proved stable for a delay that varies from packet to packet"
+CHANGES_IN_BOX = "no box is proved with a varying delay; the scenarios were evaluated"
 
 # The text if the search for the worst point of a box is too slow.
-CORNERS = (
-    "before rounding: the ends and the middle of each range in a box were looked at, and no point between"
-)
+CORNERS = "before rounding: only the ends and the middle of each range in a box were evaluated"
 
 # The text if no gains that satisfy all demands were found in time.
-TIMED_OUT = "the time was up: these gains are those that were looked at last"
+TIMED_OUT = "the time limit was reached; the gains are the last evaluated"
 
-# Scenarios added at a time; how far above the others a limit is that counts.
+# Scenarios added at a time; the least excess of a constraint over the others for an addition.
 MORE, ABOVE = 3, 1e-9
 
 # Number of settings in which the worst interior point of a box is searched, starting with the largest
 # constraints at corners.
 MOST_LIMITED = 8
 
-# Scenarios, those first that limit gains most, in one of which gains that would do better are unstable.
+# The number of scenarios, by decreasing constraints, in the proof that better gains are unstable.
 LIMITING = 12
 
-# Turns in which scenarios that limit nothing are left out.
+# The number of iterations after which inactive scenarios are removed.
 DROPPING = 6
 
 
 @dataclass(frozen=True, slots=True)
 class Gain:
-    """A free gain: its decimal `value`, exact, the optimum before rounding, and its present value `now`."""
+    """A free gain: decimal `value`, exact; `optimum` before rounding; `current` value; range in SI."""
 
     parameter: str
     unit: str
@@ -112,11 +108,11 @@ class Gain:
 
 @dataclass(frozen=True, slots=True)
 class ActiveConstraint:
-    """An active constraint: a mode in a scenario, or an end of a gain's range.
+    """An active constraint: a critical mode in a scenario.
 
     `where` are the scenario's values as (label, value, unit). `family` and `frequency_hz` are those of the
-    mode, "" and NaN if the criterion has none. `shadow_prices` are the active ends of the scenario ranges, as
-    (label, end, unit, improvement of the objective for 1 % less).
+    mode, "" and NaN if the criterion has no mode. `shadow_prices` are the active ends of the scenario ranges,
+    as (label, end, unit, improvement of the objective if the end is 1 % smaller).
     """
 
     where: tuple[tuple[str, float, str], ...]
@@ -127,7 +123,7 @@ class ActiveConstraint:
 
 @dataclass(frozen=True, slots=True)
 class Proved:
-    """The proof for some numbers of peers, as (label, number): over all other ranges."""
+    """The proof over all other ranges for one combination of numbers of peers, as (label, number)."""
 
     counts: tuple[tuple[str, int], ...]
     proof: RobustStability
@@ -137,16 +133,17 @@ class Proved:
 class Tuning(Result):
     """The optimal gains, the proof, and the active constraints.
 
-    `value` is the objective at the decimal gains, `optimum` that before rounding, within `error` (infinite if
-    unknown); both are a spectral radius if that is the objective. `feasible` is whether the gains satisfy all
-    demands in floats; `proved` whether all are proved. `worst_case` is the largest constraint (see
-    `constraints`), ln |λ| per frame minus the `allowed` value, below 0 if all are satisfied. `decay` is a
-    factor per second. `delay` is the one of `over` that a link has, at every constant value; `changing` is
+    `value` is the objective at the decimal gains, `optimum` the objective before rounding, within `error`
+    (infinite if unknown); both are a spectral radius if that is the objective. `feasible` states whether the
+    gains satisfy all demands in floats; `proved` whether all demands are proved. `worst_case` is the largest
+    constraint (see `constraints`), the logarithm of the largest eigenvalue magnitude per frame minus the
+    `allowed` value, below 0 if all are satisfied.
+    `decay` is a factor per second. `delay` is the range of a link's constant delay in `over`; `changing` is
     the result for a delay that varies from packet to packet, by numbers of peers as in `proofs`, with all
-    other parameters at their present values, and `demanded` whether this stability is a demand. `topologies`
-    are those of `active`, or one if nothing binds. `evaluations` is the number of evaluations. `bound_cells`
-    is the number of cells in the proof that no gains in these ranges are better by `optimality_bound.SHARE`,
-    None without proof.
+    other parameters at their present values, and `demanded` states whether this stability is a demand.
+    `topologies` are the models of the `active` constraints, or one without active constraints. `evaluations`
+    is the number of evaluations. `bound_cells` is the number of cells in the proof that no gains in these
+    ranges are better by `specification.OPTIMALITY_GAP`, None without proof.
     """
 
     shown_by = "tuning_output:tuning"
@@ -181,14 +178,16 @@ class Tuning(Result):
     topologies: tuple[Model, ...] = field(compare=False, repr=False)
 
     def plot(self, ax: Any = None) -> Any:
-        """Draw two gains over the stable regions of the limiting scenarios, and a strike; return the Axes.
+        """Draw two gains over the stable regions of the active scenarios, and an impulse response; return
+        Axes.
 
-        A strike is simulated with the present and the tuned gains, in the scenario that limits them most.
+        The impulse is simulated with the present and the tuned gains, in the most critical scenario.
 
         Raises
         ------
         ApcError
-            E875 matplotlib is not installed; those of `regions.stable_region` and `trajectory.simulate`.
+            E875 matplotlib is not installed; the errors of `regions.stable_region` and
+            `trajectory.simulate`.
         """
         return self._shown("picture", ax)
 
@@ -201,7 +200,7 @@ def tune(
     seconds: float = math.inf,
     progress: Progress | None = None,
 ) -> Tuning:
-    """Optimize the gains, and prove that they satisfy all demands.
+    """Return the optimal gains under all demands, with the proof that the demands are satisfied.
 
     Parameters
     ----------
@@ -215,16 +214,16 @@ def tune(
     Raises
     ------
     ApcError
-        Those of the analyses, such as E898 an unsupported network; of `transparency`; E996 a transparency
-        metric is undefined everywhere.
+        The errors of the analyses, such as E898 an unsupported network, and of `transparency`; E996 a
+        transparency metric that is undefined everywhere.
     """
     with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
-        return _Work(system, spec, time.monotonic() + seconds, progress or (lambda _: None)).done()
+        return _Tuner(system, spec, time.monotonic() + seconds, progress or (lambda _: None)).tuned()
 
 
 @dataclass(eq=False)
-class _Work:
-    """The work: its scenarios grow."""
+class _Tuner:
+    """The optimization of the gains of a specification: scenarios are added until the proof succeeds."""
 
     system: Model
     spec: TuningSpec
@@ -234,16 +233,16 @@ class _Work:
     evaluations: int = 0
 
     def __post_init__(self) -> None:
-        self.constraints = ConstraintSet(self.system, prepare(self.system), self.spec, self.until)
+        self.constraints = ConstraintSet(numeric_model(self.system), self.spec, self.until)
         # A metric that is undefined everywhere is refused before the search.
-        requested = [metric for metric in self.spec.transparency_metrics if metric.name in RESPONSES]
-        requested += [metric for metric in self.spec.measured if metric.name == HINF]
-        if requested:
-            transparency_in(self.system, requested, self.constraints.prepared)
+        metrics = [metric for metric in self.spec.transparency_metrics if metric.name in RESPONSES]
+        metrics += [metric for metric in self.spec.measured if metric.name == HINF]
+        if metrics:
+            transparency_in(self.constraints.numeric, metrics)
         self.every = self.constraints.every()
         self.present = np.array([float(value_now(self.system, interval.free)) for interval in self.spec.free])
-        first = len(self.every) // len(self.constraints.settings)
-        self.scenarios = list(dict.fromkeys((self.every[0], self.every[-first])))
+        scenarios_per_setting = len(self.every) // len(self.constraints.settings)
+        self.scenarios = list(dict.fromkeys((self.every[0], self.every[-scenarios_per_setting])))
         if self.spec.changing:
             try:
                 self.constraints.changing(0, np.array([[*self.present, *self.every[0].point]]))
@@ -255,16 +254,18 @@ class _Work:
             self._with_level()
 
     def _with_level(self) -> None:
-        """Determine the search range of the objective's level, from the best known value on."""
-        search = ScenarioOptimizer(self.constraints, self.scenarios, None)
-        points = np.vstack([self.present, search.gains(search.even)])
+        """Set the search range of the objective's level, from the best sampled value on."""
+        optimizer = ScenarioOptimizer(self.constraints, self.scenarios, None)
+        points = np.vstack([self.present, optimizer.gains(optimizer.sample_points)])
         sums = self.constraints.sums(self.scenarios, points)
-        known = sums[np.isfinite(sums)]
-        if not len(known):
-            message = f"nothing is known of {self.spec.objective.label} with any gains that were looked at"
-            raise ApcError(Diagnostic("E996", LOCATION, message, hint="wider ranges, or another aim"))
-        best = float(known.max() if self.spec.objective.maximize else known.min())
-        scale = abs(best) or float(np.abs(known).max()) or 1.0
+        finite_sums = sums[np.isfinite(sums)]
+        if not len(finite_sums):
+            message = f"{self.spec.objective.label} is unknown at all evaluated gains"
+            raise ApcError(
+                Diagnostic("E996", LOCATION, message, advice="use wider ranges, or another objective")
+            )
+        best = float(finite_sums.max() if self.spec.objective.maximize else finite_sums.min())
+        scale = abs(best) or float(np.abs(finite_sums).max()) or 1.0
         name, unit = ParameterRef(self.spec.objective.label), self.spec.objective.unit
         level = Range(name, unit, Fraction(best), Fraction(best) + Fraction(scale))
         self.spec = replace(self.spec, objective=replace(self.spec.objective, level=level, scale=scale))
@@ -273,167 +274,197 @@ class _Work:
 
     @property
     def _unproved(self) -> bool:
-        """Whether the demands beyond stability have no proof method."""
-        decays = self.constraints.by_scalar_criterion and (
+        """Whether some demand beyond stability has no proof method."""
+        decay_of_scalar = self.constraints.by_scalar_criterion and (
             self.spec.decay < 1 or self.spec.objective.column is None
         )
         boxed = self.spec.criterion == PASSIVE and self.spec.box
         transparency_metrics = self.spec.measured and (self.spec.box or self.spec.delay)
-        gains = any(
+        peak_gains = any(
             metric.name == HINF for metric in self.spec.measured
-        )  # right to an error, not bounded by it
-        return decays or gains or bool(boxed or transparency_metrics)
+        )  # with an error estimate, not a bound
+        return decay_of_scalar or peak_gains or bool(boxed or transparency_metrics)
 
     @property
     def timed_out(self) -> bool:
+        """Whether the time limit is reached."""
         return self.constraints.timed_out
 
-    def done(self) -> Tuning:
+    def tuned(self) -> Tuning:
+        """Return the gains that are optimal, rounded and proved, or the result that the demands cannot be
+        satisfied.
+
+        While the proof finds a scenario in which the rounded gains are unstable, it is added and all is
+        repeated, up to the time limit.
+        """
         objective = self.spec.objective
         starts: list[Floats] = []
         while True:
             optimum = self._optimize_scenarios(objective.column, starts)
-            if (
-                objective.column is not None and optimum.worst_case > BINDS
-            ):  # perhaps they only were not found
-                least = self._optimize_scenarios(None, [])
-                if least.worst_case > 0:
-                    return self._unmet(least)
-                optimum = self._optimize_scenarios(objective.column, [self._shares(least)])
+            # The descent ended at gains that violate a constraint, but others may satisfy all.
+            if objective.column is not None and optimum.worst_case > BINDS:
+                least_violation = self._optimize_scenarios(None, [])
+                if least_violation.worst_case > 0:
+                    return self._infeasible_result(least_violation)
+                optimum = self._optimize_scenarios(objective.column, [self._shares(least_violation)])
             if objective.column is None and self.spec.decay < 1 and optimum.worst_case > BINDS:
-                return self._unmet(optimum)
-            gains, proofs, failed = self._settled(optimum)
-            if failed is None or self.timed_out:
-                return self._answer(optimum, gains, proofs)
-            self.scenarios.append(failed)
+                return self._infeasible_result(optimum)
+            gains, proofs, violated = self._rounded_and_proved(optimum)
+            if violated is None or self.timed_out:
+                return self._result(optimum, gains, proofs)
+            self.scenarios.append(violated)
             starts = [self._shares(optimum)]
 
     def _shares(self, optimum: Optimum) -> Floats:
+        """Return the gains of an optimum as shares of their ranges."""
         return ScenarioOptimizer(self.constraints, self.scenarios, None).shares(optimum)
 
     def _optimize_scenarios(self, column: int | None, starts: list[Floats]) -> Optimum:
-        """Return the best of all scenarios, those added that limit it more than those there are."""
+        """Return the optimum over all scenarios, with scenarios of larger constraints added until none
+        exists.
+
+        Parameters
+        ----------
+        column
+            The index of the gain, or level, to optimize; None to minimize the largest constraint.
+        starts
+            The start points of the descent, as shares of the ranges; if empty, the best of the sample points.
+        """
         sign = 1.0 if self.spec.objective.maximize else -1.0
-        begun: list[Floats] = []
+        first_starts: list[Floats] = []
         for turn in itertools.count():
-            self.progress(f"looking for gains in {len(self.scenarios)} of {len(self.every)} scenarios")
-            search = ScenarioOptimizer(self.constraints, self.scenarios, column, sign)
+            self.progress(f"optimizing gains for {len(self.scenarios)} of {len(self.every)} scenarios")
+            optimizer = ScenarioOptimizer(self.constraints, self.scenarios, column, sign)
             if not starts:
-                starts = begun = search.start(self.present, self.every)
+                starts = first_starts = optimizer.start(self.present, self.every)
                 for start in starts:
-                    self.constraints.with_frequencies(self.scenarios, search.gains(start))
-            optimum = search.best_point(starts)
+                    self.constraints.with_frequencies(self.scenarios, optimizer.gains(start))
+            optimum = optimizer.best_point(starts)
             self.evaluations += optimum.evaluations
-            bound = optimum.rows.scenario[optimum.multipliers > 0]
-            if turn < DROPPING and len(bound):  # re-evaluate inactive ones with all others
-                self.scenarios = [scenario for index, scenario in enumerate(self.scenarios) if index in bound]
+            active = optimum.rows.scenario[optimum.multipliers > 0]
+            if turn < DROPPING and len(active):  # re-evaluate inactive ones with all others
+                self.scenarios = [
+                    scenario for index, scenario in enumerate(self.scenarios) if index in active
+                ]
             level = max(optimum.worst_case, 0.0 if column is not None else -math.inf)
-            starts = [search.shares(optimum)]
-            if self._added(optimum.gains, level) or self.constraints.with_frequencies(
+            starts = [optimizer.shares(optimum)]
+            if self._add_scenarios(optimum.gains, level) or self.constraints.with_frequencies(
                 self.scenarios, optimum.gains
             ):
                 if not self.timed_out:
                     continue
-                return search.at(begun[0]) if begun else optimum
-            ahead = search.start(self.present, self.every, than=optimum)
-            if self.timed_out or not ahead:
+                return optimizer.at(first_starts[0]) if first_starts else optimum
+            better_starts = optimizer.start(self.present, self.every, than=optimum)
+            if self.timed_out or not better_starts:
                 return optimum
-            starts += ahead
+            starts += better_starts
         raise AssertionError("turns never end")
 
-    def _added(self, gains: Floats, level: float) -> bool:
-        """Add the scenarios with constraints above a level; return whether there were any."""
+    def _add_scenarios(self, gains: Floats, level: float) -> bool:
+        """Add the scenarios with constraints above a level; return whether any were added."""
         worst = self.constraints.worst_case(self.every, gains[None])[0]
         order = np.argsort(-worst)
-        new = [self.every[index] for index in order[:MORE] if worst[index] > level + ABOVE]
-        new = [item for item in new if item not in self.scenarios]
-        if not new and self.spec.box and not self.constraints.slow:
+        additions = [self.every[index] for index in order[:MORE] if worst[index] > level + ABOVE]
+        additions = [candidate for candidate in additions if candidate not in self.scenarios]
+        if not additions and self.spec.box and not self.constraints.slow:
             nearest = dict.fromkeys(self.every[index].setting for index in order.tolist())
-            within = (
-                self.constraints.worst_case_within(item, gains) for item in list(nearest)[:MOST_LIMITED]
+            interior = (
+                self.constraints.worst_case_within(candidate, gains)
+                for candidate in list(nearest)[:MOST_LIMITED]
             )
-            new = [
+            additions = [
                 scenario
-                for scenario, value in within
+                for scenario, value in interior
                 if value > level + ABOVE and scenario not in self.scenarios
             ]
-        self.scenarios += new
-        return bool(new)
+        self.scenarios += additions
+        return bool(additions)
 
-    def _settled(self, optimum: Optimum) -> tuple[list[Fraction], list[Proved], Scenario | None]:
-        """Return decimal gains, their proof, and a scenario that they violate."""
+    def _rounded_and_proved(self, optimum: Optimum) -> tuple[list[Fraction], list[Proved], Scenario | None]:
+        """Return decimal gains, their proofs, and a scenario in which they are proved unstable, if any."""
         column = self.spec.objective.column
-        shares: tuple[float, ...] = BACK if self._unproved or not self.spec.over else BACK_IN_BOX
+        all_relaxations: tuple[float, ...] = BACK if self._unproved or not self.spec.over else BACK_IN_BOX
         if column is None:
-            shares = (0.0,)
+            all_relaxations = (0.0,)
         elif not optimum.multipliers.any():  # the end of a range, which leaves room
-            shares = (0.0, *shares)
-        left = list(shares)
+            all_relaxations = (0.0, *all_relaxations)
+        relaxations = list(all_relaxations)
         while True:
-            gains = self._rounded_gains(optimum, left[0])
+            gains = self._rounded_gains(optimum, relaxations[0])
             point = np.array([float(gain) for gain in gains])
-            if column is not None and not self.timed_out and self._added(point, -ABOVE):
+            if column is not None and not self.timed_out and self._add_scenarios(point, -ABOVE):
                 continue
-            held = column is None or float(self.constraints.worst_case(self.every, point[None]).max()) < 0
-            last = self.timed_out or len(left) == 1
-            if held or last:
+            satisfied = (
+                column is None or float(self.constraints.worst_case(self.every, point[None]).max()) < 0
+            )
+            last = self.timed_out or len(relaxations) == 1
+            if satisfied or last:
                 proofs, failed = self._proofs(gains, whole=last)
                 proved = self._unproved or all(proof.proof.stable for proof in proofs)
                 if failed is not None or last or proved:
                     return gains, proofs, failed
-            del left[0]
+            del relaxations[0]
 
     def _rounded_gains(self, optimum: Optimum, share: float) -> list[Fraction]:
-        """Return gains with the fewest digits that satisfy the scenarios, with a relaxed objective."""
-        objective, free = self.spec.objective, self.spec.free
+        """Return gains with the fewest digits that satisfy the scenarios, the objective relaxed by
+        a share.
+        """
+        objective, gain_ranges = self.spec.objective, self.spec.free
         best = self.constraints.worst_case(self.scenarios, optimum.gains[None]).max()
-        room = 0.0 if objective.column is not None else best + NEARLY * abs(best)
-        values, binds = optimum.gains.copy(), optimum.multipliers > 0
-        if objective.column is not None and binds.any():
-            # As far inside of all that binds at once, which costs the aim this share.
+        limit = 0.0 if objective.column is not None else best + NEARLY * abs(best)
+        values, is_active = optimum.gains.copy(), optimum.multipliers > 0
+        if objective.column is not None and is_active.any():
+            # Into the interior of all active constraints, at the cost of this share of the objective.
             width = np.array([float(interval.high - interval.low) for interval in self.spec.columns])
-            inwards = np.linalg.lstsq(optimum.rows.slopes[binds], -np.ones(binds.sum()), rcond=None)[0]
+            direction = np.linalg.lstsq(
+                optimum.rows.slopes[is_active], -np.ones(is_active.sum()), rcond=None
+            )[0]
             cost = float(width[objective.column] * optimum.multipliers.sum())
-            values += share * abs(values[objective.column]) / cost * width * inwards
+            values += share * abs(values[objective.column]) / cost * width * direction
         gains: list[Fraction] = []
         for digits in range(DIGITS if self.timed_out else 1, DIGITS + 1):
             gains = [_decimal(value, digits) for value in values.tolist()]
             if objective.column is not None:
-                gains[objective.column] = self._back(float(optimum.gains[objective.column]), share)
-            pairs = zip(gains, free, strict=False)
-            gains[: len(free)] = [min(max(gain, interval.low), interval.high) for gain, interval in pairs]
+                gains[objective.column] = self._relaxed_gain(float(optimum.gains[objective.column]), share)
+            pairs = zip(gains, gain_ranges, strict=False)
+            gains[: len(gain_ranges)] = [
+                min(max(gain, interval.low), interval.high) for gain, interval in pairs
+            ]
             point = np.array([[float(gain) for gain in gains]])
-            if self.constraints.worst_case(self.scenarios, point).max() <= room:
+            if self.constraints.worst_case(self.scenarios, point).max() <= limit:
                 break
         if objective.level:
-            gains[-1] = self._worth(gains)
+            gains[-1] = self._satisfied_level(gains)
         return gains
 
-    def _worth(self, gains: Sequence[Fraction]) -> Fraction:
-        """Return the level that an aim keeps with gains in every scenario, rounded to where it is kept."""
+    def _satisfied_level(self, gains: Sequence[Fraction]) -> Fraction:
+        """Return the level of the objective that gains satisfy in every scenario, with rounding in its
+        favour.
+        """
         point = np.array([float(gain) for gain in gains])
-        larger, sums = self.spec.objective.maximize, self.constraints.sums(self.every, point[None])
-        worst = float(sums.min() if larger else sums.max())
+        is_maximized, sums = self.spec.objective.maximize, self.constraints.sums(self.every, point[None])
+        worst = float(sums.min() if is_maximized else sums.max())
         if not math.isfinite(worst):
             return gains[-1]
-        margin = (-1 if larger else 1) * SLACK * self.spec.objective.scale
-        return _decimal(worst + margin, DIGITS + 1, ROUND_FLOOR if larger else ROUND_CEILING)
+        margin = (-1 if is_maximized else 1) * SLACK * self.spec.objective.scale
+        return _decimal(worst + margin, DIGITS + 1, ROUND_FLOOR if is_maximized else ROUND_CEILING)
 
-    def _back(self, value: float, share: float) -> Fraction:
-        """Return a gain less a share of it, rounded to the side where it does less."""
-        larger = self.spec.objective.maximize
-        moved = value * (1 - share if larger == (value > 0) else 1 + share)
-        return _decimal(moved, DIGITS, ROUND_FLOOR if larger else ROUND_CEILING)
+    def _relaxed_gain(self, value: float, share: float) -> Fraction:
+        """Return the objective's gain relaxed by a share, rounded to the relaxed side."""
+        is_maximized = self.spec.objective.maximize
+        relaxed = value * (1 - share if is_maximized == (value > 0) else 1 + share)
+        return _decimal(relaxed, DIGITS, ROUND_FLOOR if is_maximized else ROUND_CEILING)
 
     def _proofs(self, gains: Sequence[Fraction], *, whole: bool) -> tuple[list[Proved], Scenario | None]:
-        """Return the proofs for each number of peers, starting with the largest constraint.
+        """Return the proofs for each combination of numbers of peers, the largest constraint first.
 
-        Without `whole` only as far as one that is left open.
+        A second result is a scenario in which the gains are proved unstable, if any. Without `whole`, the
+        proofs end with the first undecided one.
         """
-        inside = self._inside(gains)
+        inside = self._required_radius(gains)
         delay, counts = self.spec.delay, self.spec.counts
         ranges = [*([delay] if delay else []), *self.spec.box]
-        changes = [
+        gain_overrides = [
             Override(interval.free, value) for interval, value in zip(self.spec.free, gains, strict=False)
         ]
         point = np.array([[float(gain) for gain in gains]])
@@ -444,68 +475,80 @@ class _Work:
             order[numbers[: len(counts)]] = None
         proveds: list[Proved] = []
         for numbers in order:
-            named = tuple((number.free.label, int(number.value)) for number in numbers)
+            labelled_counts = tuple((number.free.label, int(number.value)) for number in numbers)
             if self.timed_out:
-                proveds.append(Proved(named, _unlooked(self.system.name, ranges)))
+                proveds.append(Proved(labelled_counts, _timed_out_proof(self.system.name, ranges)))
                 continue
-            self.progress(f"proving {len(proveds) + 1} of {len(order)}")
-            topology = apply(self.system, [*changes, *numbers])
+            self.progress(f"proving scenario {len(proveds) + 1} of {len(order)}")
+            topology = apply(self.system, [*gain_overrides, *numbers])
             passive = self.spec.criterion == PASSIVE
             if passive and self.spec.box:
                 proveds.append(
-                    Proved(named, replace(_unlooked(self.system.name, ranges), notes=(POINTWISE,)))
+                    Proved(
+                        labelled_counts,
+                        replace(_timed_out_proof(self.system.name, ranges), notes=(POINTWISE,)),
+                    )
                 )
                 continue
-            inner = 1.0 if self.constraints.by_scalar_criterion else inside
+            radius_limit = 1.0 if self.constraints.by_scalar_criterion else inside
             try:
-                proof = proved_at(topology, ranges, passive=passive, inside=inner)
+                proof = proved_at(topology, ranges, passive=passive, inside=radius_limit)
             except ApcError as error:
                 if not ranges:
                     raise
-                # No box of such models is proved, as of those that are not linear.
-                proof = replace(_unlooked(self.system.name, ranges), notes=(error.mistakes[0].message,))
-            if proof.stable and (self._unproved or not self._transparency_metrics(numbers, point)):
+                # For example of nonlinear models, boxes cannot be proved.
+                proof = replace(
+                    _timed_out_proof(self.system.name, ranges), notes=(error.mistakes[0].message,)
+                )
+            if proof.stable and (self._unproved or not self._transparency_is_proved(numbers, point)):
                 proof = replace(proof, verdict=UNDECIDED, stable=None, notes=(*proof.notes, SLOWER))
             if proof.stable and self.spec.changing and not self._stable_if_changing(topology):
                 note = CHANGES_IN_BOX if self.spec.box else CHANGES
                 proof = replace(proof, verdict=UNDECIDED, stable=None, notes=(*proof.notes, note))
-            proveds.append(Proved(named, proof))
+            proveds.append(Proved(labelled_counts, proof))
             if proof.stable is False:
-                return proveds, self._failed(numbers, proof, ranges)
+                return proveds, self._violated_scenario(numbers, proof, ranges)
             if not (proof.stable or whole):
                 break
         return proveds, None
 
     def _stable_if_changing(self, topology: Model) -> bool:
-        """Return whether a model is proved stable under a delay that changes, where nothing else varies."""
+        """Return whether a model is proved stable under a delay that changes from packet to packet."""
         delay = self.spec.delay
         if delay is None or self.spec.box:
             return False
         try:
-            return loop_gain(topology, delay.free, delay.low, delay.high) < 1
+            gain: float = require_extension("loss_models").loop_gain(
+                topology, delay.free, delay.low, delay.high
+            )
+            return gain < 1
         except NotSupportedError:
             return False
 
-    def _changing(
+    def _varying_delay_results(
         self, gains: Sequence[Fraction], proofs: Sequence[Proved]
     ) -> Iterator[tuple[tuple[tuple[str, int], ...], ChangingDelay]]:
-        """Yield the proofs under a time-varying delay, for each number of peers with a proof."""
+        """Yield the results under a time-varying delay, for each combination of numbers of peers with
+        a proof.
+        """
         spec = self.spec
-        if spec.delay is None or spec.criterion != NOMINAL:
+        extension = find_extension("parameter_boxes")
+        if extension is None or spec.delay is None or spec.criterion != NOMINAL:
             return
         pairs = zip(spec.free, gains, strict=False)
-        changes = [Override(interval.free, value) for interval, value in pairs]
-        for item in proofs:
-            result = item.proof.changing
-            if result is None and item.proof.stable is not False and not self.timed_out:
-                values = zip(spec.counts, item.counts, strict=True)
+        gain_overrides = [Override(interval.free, value) for interval, value in pairs]
+        for proved in proofs:
+            result = proved.proof.changing
+            if result is None and proved.proof.stable is not False and not self.timed_out:
+                values = zip(spec.counts, proved.counts, strict=True)
                 counts = [Override(count.free, Fraction(number)) for count, (_, number) in values]
-                result = changing(apply(self.system, [*changes, *counts]), spec.delay)
+                changed = apply(self.system, [*gain_overrides, *counts])
+                result = extension.varying_delay_result(changed, spec.delay)
             if result is not None:
-                yield item.counts, result
+                yield proved.counts, result
 
-    def _transparency_metrics(self, numbers: tuple[Override, ...], point: Floats) -> bool:
-        """Return whether the transparency demands are proved, if only numbers of peers vary."""
+    def _transparency_is_proved(self, numbers: tuple[Override, ...], point: Floats) -> bool:
+        """Return whether the transparency demands are proved at these numbers of peers."""
         indices = [
             index for index, (overrides, _) in enumerate(self.constraints.settings) if overrides == numbers
         ]
@@ -515,48 +558,54 @@ class _Work:
         ]
         return max(result, default=-1.0) < 0
 
-    def _inside(self, gains: Sequence[Fraction]) -> float:
-        """Return the limit of the spectral radius in the proof: slightly above the minimum."""
+    def _required_radius(self, gains: Sequence[Fraction]) -> float:
+        """Return the limit of the spectral radius in the proof.
+
+        If the objective is the decay rate, the limit is slightly above the minimum.
+        """
         if self.spec.objective.column is not None or self.constraints.by_scalar_criterion:
             return math.exp(self.constraints.allowed)
         point = np.array([[float(gain) for gain in gains]])
-        least = 1 - math.exp(
+        margin = 1 - math.exp(
             float(self.constraints.worst_case(self.every, point).max()) + self.constraints.allowed
         )
-        return float(1 - _decimal(least * (1 - BACK[-1]), DIGITS, ROUND_FLOOR))
+        return float(1 - _decimal(margin * (1 - BACK[-1]), DIGITS, ROUND_FLOOR))
 
-    def _failed(
+    def _violated_scenario(
         self, numbers: tuple[Override, ...], proof: RobustStability, ranges: Sequence[Range]
     ) -> Scenario | None:
-        """Return the scenario in which gains are proved not to hold; None where it is one already."""
+        """Return the scenario of a counterexample; None if it is already a scenario of the search."""
         values = dict(zip([interval.free for interval in ranges], proof.counterexample, strict=False))
         timed_out = self.spec.delay and values.get(self.spec.delay.free)
         for index, (overrides, _) in enumerate(self.constraints.settings):
-            here = len(overrides) == len(numbers) or float(overrides[-1].value) == timed_out
-            if overrides[: len(numbers)] == numbers and here:
+            same_delay = len(overrides) == len(numbers) or float(overrides[-1].value) == timed_out
+            if overrides[: len(numbers)] == numbers and same_delay:
                 box = tuple(values[interval.free] for interval in self.spec.box)
                 scenario = Scenario(index, box)
                 return None if scenario in self.scenarios else scenario
         return None
 
-    def _unmet(self, least: Optimum) -> Tuning:
-        """Return that no gains were found that meet all demands, and those that miss them least."""
-        gains = [_decimal(value, DIGITS) for value in least.gains.tolist()]
+    def _infeasible_result(self, least_violation: Optimum) -> Tuning:
+        """Return the result without feasible gains: the gains with the least violation."""
+        gains = [_decimal(value, DIGITS) for value in least_violation.gains.tolist()]
         if self.spec.objective.level:
-            gains[-1] = self._worth(gains)
-        return self._answer(least, gains, [], feasible=False)
+            gains[-1] = self._satisfied_level(gains)
+        return self._result(least_violation, gains, [], feasible=False)
 
-    def _answer(
+    def _result(
         self, optimum: Optimum, gains: Sequence[Fraction], proofs: Sequence[Proved], *, feasible: bool = True
     ) -> Tuning:
+        """Return the result with the objective, the gains, the active constraints and the
+        optimality bound.
+        """
         spec, column = self.spec, self.spec.objective.column
-        worst = float(
+        largest_constraint = float(
             self.constraints.worst_case(self.every, np.array([[float(gain) for gain in gains]])).max()
         )
-        feasible = feasible and (column is None or worst < 0)
-        value = float(gains[column]) if column is not None else self._inside(gains)
+        feasible = feasible and (column is None or largest_constraint < 0)
+        value = float(gains[column]) if column is not None else self._required_radius(gains)
         if column is None and self.constraints.by_scalar_criterion:
-            value = math.exp(worst + self.constraints.allowed)
+            value = math.exp(largest_constraint + self.constraints.allowed)
         best, error = (
             (optimum.value, optimum.error) if column is not None else (math.exp(optimum.value), optimum.error)
         )
@@ -572,7 +621,7 @@ class _Work:
             value=value,
             optimum=best,
             error=error,
-            worst_case=worst,
+            worst_case=largest_constraint,
             gains=tuple(
                 Gain(
                     interval.free.label,
@@ -580,10 +629,10 @@ class _Work:
                     float(interval.low),
                     float(interval.high),
                     rounded,
-                    float(before),
+                    float(exact_optimum),
                     float(now),
                 )
-                for interval, rounded, before, now in zip(
+                for interval, rounded, exact_optimum, now in zip(
                     spec.free, gains, optimum.gains, self.present, strict=False
                 )
             ),
@@ -592,22 +641,22 @@ class _Work:
             decay=spec.decay,
             transparency_metrics=spec.transparency_metrics,
             delay=spec.delay,
-            changing=tuple(self._changing(gains, proofs)) if feasible else (),
+            changing=tuple(self._varying_delay_results(gains, proofs)) if feasible else (),
             demanded=spec.changing,
-            frame_s=float(self.constraints.prepared.schedules[0].frame_s),
+            frame_s=float(self.constraints.numeric.schedules[0].frame_s),
             allowed=self.constraints.allowed,
             proofs=tuple(proofs),
-            active=tuple(self._active(optimum, feasible=feasible)),
+            active=tuple(self._active_constraints(optimum, feasible=feasible)),
             evaluations=self.evaluations
             + sum(int((sample != BEYOND).sum()) for sample in self.constraints.samples.values()),
             bound_cells=self._optimality_bound(optimum, gains) if feasible else None,
             notes=(
-                *[why for why in (self._why(),) if why and not feasible],
+                *[reason for reason in (self._instability_reason(),) if reason and not feasible],
                 *[CORNERS] * bool(spec.box and self.constraints.slow),
                 *[TIMED_OUT] * (self.timed_out and not feasible),
             ),
             limitations=(
-                *near_start(self.system, self.constraints.prepared),
+                *near_start(self.constraints.numeric),
                 *limitations(
                     self.system,
                     network=spec.criterion != MEAN_SQUARE,
@@ -615,15 +664,17 @@ class _Work:
                 ),
             ),
             ranges=spec.free,
-            topologies=tuple(map(self._topology, self._active_scenarios(optimum) or self.every[:1])),
+            topologies=tuple(map(self._model_of, self._active_scenarios(optimum) or self.every[:1])),
         )
 
-    def _why(self) -> str:
-        """Return the reason why no gains are stable with passive hands, if the equations imply it."""
-        return absolute_stability(self.system).why if self.spec.criterion == PASSIVE else ""
+    def _instability_reason(self) -> str:
+        """Return the reason why no gains are stable with passive hands, "" if the equations do not
+        imply it.
+        """
+        return absolute_stability(numeric_model(self.system)).why if self.spec.criterion == PASSIVE else ""
 
     def _optimality_bound(self, optimum: Optimum, gains: Sequence[Fraction]) -> int | None:
-        """Return in how many cells it is proved that no gains do better, see `none_better`."""
+        """Return the number of cells in the proof that no gains are better; None without a proof."""
         spec, column = self.spec, self.spec.objective.column
         if (
             column is None
@@ -634,32 +685,37 @@ class _Work:
             or spec.objective.level
         ):
             return None
+        extension = find_extension("parameter_boxes")
+        if extension is None:
+            return None
         worst = self.constraints.worst_case(self.every, np.array([[float(gain) for gain in gains]]))[0]
         order = np.argsort(-worst, kind="stable").tolist()
-        listed = dict.fromkeys([*self._active_scenarios(optimum), *(self.every[index] for index in order)])
-        self.progress("proving that no gains do better")
-        return none_better(
-            [self._topology(item) for item in list(listed)[:LIMITING]],
-            self.constraints.prepared,
+        scenarios = dict.fromkeys([*self._active_scenarios(optimum), *(self.every[index] for index in order)])
+        self.progress("proving global optimality")
+        cells: int | None = extension.cells_without_better_gains(
+            [self._model_of(item) for item in list(scenarios)[:LIMITING]],
+            self.constraints.numeric,
             spec.free,
             column,
             value=gains[column],
             larger=spec.objective.maximize,
-            inside=self._inside(gains),
+            inside=self._required_radius(gains),
             until=self.until,
         )
+        return cells
 
     def _active_scenarios(self, optimum: Optimum) -> list[Scenario]:
-        """Return the scenario of each mode that binds."""
+        """Return the scenario of each active constraint."""
         return [optimum.scenarios[index] for index in optimum.rows.scenario[optimum.multipliers > 0].tolist()]
 
-    def _topology(self, scenario: Scenario) -> Model:
+    def _model_of(self, scenario: Scenario) -> Model:
+        """Return the model of a scenario, with its numbers of peers, delay and box parameters."""
         _, topology = self.constraints.settings[scenario.setting]
         pairs = zip(self.spec.box, map(Fraction, scenario.point), strict=True)
         return apply(topology, [Override(interval.free, value) for interval, value in pairs])
 
-    def _active(self, optimum: Optimum, *, feasible: bool) -> list[ActiveConstraint]:
-        """Return the active constraints: each mode with a multiplier, and the benefit of narrower ranges."""
+    def _active_constraints(self, optimum: Optimum, *, feasible: bool) -> list[ActiveConstraint]:
+        """Return the active constraints, with the benefit of narrower ranges."""
         bindings = []
         objective = self.spec.objective.column
         rows = self.constraints.rows(optimum.scenarios, optimum.gains, wide=True)
@@ -672,12 +728,12 @@ class _Work:
             numbers, _ = self.constraints.settings[scenario.setting]
             shadow_prices = []
             slopes = rows.slopes[index][len(self.spec.columns) :]
-            for local, value, slope in zip(self.spec.box, scenario.point, slopes, strict=True):
-                if value in (float(local.low), float(local.high)):
-                    share = 0.01 * abs(value) / float(local.high - local.low)
-                    change = -share if value == float(local.high) else share
-                    better = -scale * float(optimum.multipliers[index]) * float(slope) * change
-                    shadow_prices.append((local.free.label, value, local.unit, better))
+            for box_range, value, slope in zip(self.spec.box, scenario.point, slopes, strict=True):
+                if value in (float(box_range.low), float(box_range.high)):
+                    share = 0.01 * abs(value) / float(box_range.high - box_range.low)
+                    change = -share if value == float(box_range.high) else share
+                    improvement = -scale * float(optimum.multipliers[index]) * float(slope) * change
+                    shadow_prices.append((box_range.free.label, value, box_range.unit, improvement))
             where = [
                 (number.free.label, float(number.value), "1") for number in numbers[: len(self.spec.counts)]
             ]
@@ -688,26 +744,26 @@ class _Work:
                 (interval.free.label, value, interval.unit)
                 for interval, value in zip(self.spec.box, scenario.point, strict=True)
             ]
-            shape, frequency = self._mode(optimum, scenario, complex(rows.eigenvalue[index]))
+            shape, frequency = self._mode_of(optimum, scenario, complex(rows.eigenvalue[index]))
             if not math.isnan(rows.frequency_hz[index]):
                 frequency = float(rows.frequency_hz[index])
             bindings.append(ActiveConstraint(tuple(where), shape, frequency, tuple(shadow_prices)))
         return bindings
 
-    def _mode(self, optimum: Optimum, scenario: Scenario, eigenvalue: complex) -> tuple[str, float]:
-        """Return the shape and the frequency of a mode, "" and NaN where there is none."""
+    def _mode_of(self, optimum: Optimum, scenario: Scenario, eigenvalue: complex) -> tuple[str, float]:
+        """Return the name and the frequency in Hz of the mode of a constraint, "" and NaN without a mode."""
         passive = self.spec.criterion == PASSIVE
         if np.isnan(eigenvalue) and not (passive and not self.spec.measured):
             return "", math.nan
         pairs = zip(self.spec.free, map(Fraction, optimum.gains.tolist()), strict=False)
         changed = apply(
-            self._topology(scenario), [Override(interval.free, value) for interval, value in pairs]
+            self._model_of(scenario), [Override(interval.free, value) for interval, value in pairs]
         )
         if passive:
-            worst = absolute_stability(changed).worst_mode
+            worst = absolute_stability(numeric_model(changed)).worst_mode
             return ("", math.nan) if worst is None else (worst.name, worst.frequency_hz or math.nan)
         try:
-            modes = analyze(changed).modes
+            modes = analyze(numeric_model(changed)).modes
         except ApcError:
             return "", math.nan
         if not len(modes):
@@ -717,12 +773,12 @@ class _Work:
 
 
 def _decimal(value: float, digits: int, rounding: str = ROUND_HALF_EVEN) -> Fraction:
-    """Return a number to `digits` digits, as a decimal."""
+    """Return a number rounded to `digits` significant digits, as an exact decimal."""
     number = Decimal(repr(float(value)))
     index = number.adjusted() - digits + 1
     return Fraction(number.quantize(Decimal((0, (1,), index)), rounding=rounding)) if number else Fraction(0)
 
 
-def _unlooked(name: str, ranges: Sequence[Range]) -> RobustStability:
-    """Return the proof status at the time limit."""
-    return RobustStability(name, tuple(ranges), UNDECIDED, None, 0, 1.0, (), ("the time was up",))
+def _timed_out_proof(name: str, ranges: Sequence[Range]) -> RobustStability:
+    """Return an undecided proof, as the time limit is reached."""
+    return RobustStability(name, tuple(ranges), UNDECIDED, None, 0, 1.0, (), ("the time limit was reached",))

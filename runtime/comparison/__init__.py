@@ -1,1 +1,0 @@
-"""Comparison of schemes: the same analyses of several models."""

@@ -1,1 +1,0 @@
-"""All peers together: their modes, rigid motions and spectrum, with a bound for every error."""

@@ -1,0 +1,1 @@
+"""The verdict under every order of simultaneous events."""

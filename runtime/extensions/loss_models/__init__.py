@@ -1,0 +1,1 @@
+"""Packet losses beyond independent ones: bursts, substitution, recorded delays, consecutive losses."""

@@ -1,0 +1,1 @@
+"""The lifted matrices of Rakhsha and Constantinescu, eqs. (18) to (20)."""

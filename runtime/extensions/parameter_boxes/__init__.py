@@ -1,0 +1,1 @@
+"""Proofs of stability over boxes of parameters and ranges of delays."""

@@ -1,0 +1,1 @@
+"""Gains between two objectives that no other gains improve in both."""

@@ -1,0 +1,1 @@
+"""Contacts that switch arbitrarily (circle criterion), and limit cycles (describing function)."""

@@ -1,0 +1,1 @@
+"""Published conditions of a virtual wall, over a region of two parameters."""

@@ -1,1 +1,0 @@
-"""One peer over one frame: linearization, discretization and lifting, in floats and exactly."""

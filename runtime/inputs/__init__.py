@@ -1,0 +1,1 @@
+"""Topologies and compiled models from files, with the settings of a command."""

@@ -1,0 +1,1 @@
+"""Linearized equations of a peer: Jacobians, branches and kinks, evaluation at a point."""

@@ -1,1 +1,0 @@
-"""Analyses at many parameter values, and the values between them at which the verdict changes."""

@@ -1,0 +1,1 @@
+"""All peers: interconnection, deflation of rigid modes, eigenvalues with error bounds, determinants."""

@@ -1,0 +1,119 @@
+"""Equal peers on any graph, r = W s: one loop for each eigenvalue of W.
+
+Takes: a group of equal peers, the graph common to all their coupling terms, an eigenvalue of its W.
+Gives: `common_graph`, `GraphScale`, `graph_scale`, `graph_loop`.
+Guarantees: exact weights where the eigenvalue is rational; else an error bound, and the closed form.
+Does not: compute the eigenvalues of W (see `graph_modes`).
+
+An eigenvalue λ gives a system of one subsystem, r = λ s, with the multiplicity of λ. A complex pair λ = α ±
+iβ is one real system of two subsystems, r = [α −β; β α] s.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from fractions import Fraction
+
+import numpy as np
+
+from apc.compiler.weights import sum_weights
+from apc.spectrum.graph_modes import GraphMode, Surd
+from apc.spectrum.interconnection import Coupling, ModalSystem
+from apc.spectrum.peer_classes import PeerClass
+from apc.timing.communication_graph import CommunicationGraph, check_mean
+from apc.timing.schedule import CouplingTerm
+
+
+def common_graph(coupling_terms: Sequence[CouplingTerm], exchange: CommunicationGraph) -> str:
+    """Return the reason why the weight matrices of the links have different eigenvectors, "" if they are
+    common.
+    """
+    links = list(dict.fromkeys(coupling_term.link for coupling_term in coupling_terms))
+    shapes = {exchange.links[link].graph.shape for link in links}
+    graphs = [exchange.links[link].graph for link in links]
+    if len(shapes) > 1 or any(
+        not np.array_equal(graph.arcs, graphs[0].arcs) or not np.array_equal(graph.weights, graphs[0].weights)
+        for graph in graphs
+    ):
+        return f"the graphs of {' and '.join(links)} are not the same"
+    if (
+        len({coupling_term.operator == "mean" for coupling_term in coupling_terms}) > 1
+        and _degree(links[0], exchange) is None
+    ):
+        return f"means and sums over {links[0]}, with unequal weights"
+    if any(coupling_term.operator in ("max", "min") for coupling_term in coupling_terms):
+        return "a maximum or minimum selects the sender"
+    return ""
+
+
+def _degree(link: str, exchange: CommunicationGraph) -> Fraction | None:
+    """Return the total weight that every peer receives over a link, None if it differs between peers."""
+    pairs, weights = exchange.arcs(link)
+    sums = sum_weights(pairs[:, 1], weights, exchange.peers)
+    return sums[0] if np.all(sums == sums[0]) else None
+
+
+@dataclass(frozen=True, slots=True)
+class GraphScale:
+    """The weight of a neighbour in each coupling term; if `by_mean`, W is scaled to unit row sums."""
+
+    weights: Mapping[CouplingTerm, Fraction]
+    by_mean: bool
+
+
+def graph_scale(
+    group: PeerClass, coupling_terms: Sequence[CouplingTerm], exchange: CommunicationGraph
+) -> GraphScale:
+    """Return the weights of equal peers for their neighbours on the graph common to all coupling terms.
+
+    Raises
+    ------
+    ApcError
+        E801, E802 an undefined mean.
+    """
+    link = coupling_terms[0].link
+    means = any(coupling_term.operator == "mean" for coupling_term in coupling_terms)
+    pairs, weights = exchange.arcs(link)
+    if means:
+        sums = sum_weights(pairs[:, 1], weights, exchange.peers)
+        receives = np.bincount(pairs[:, 1], minlength=exchange.peers) > 0
+        for peer in np.flatnonzero((sums == 0) | ~receives).tolist():
+            check_mean(exchange, peer, link, "mean", bool(receives[peer]), sums[peer])
+    degree = _degree(link, exchange)
+    return GraphScale(
+        {
+            coupling_term: group.gain(coupling_term, group)
+            / (degree if degree and coupling_term.operator == "mean" else Fraction(1))
+            for coupling_term in coupling_terms
+        },
+        means and degree is None,
+    )
+
+
+def graph_loop(group: PeerClass, mode: GraphMode, scale: GraphScale) -> ModalSystem:
+    """Return the loop of an eigenvalue of W: one subsystem with a real weight, or two for a complex pair."""
+    a, b = mode.real, mode.imaginary
+    weights = scale.weights
+    weight_errors = {
+        coupling_term: float(abs(weight)) * mode.weight_error for coupling_term, weight in weights.items()
+    }
+    # A rounded eigenvalue 0 is printed as 0.
+    named = 0.0 if abs(mode.value.real) <= mode.weight_error else mode.value.real
+    name = "common" if mode.common else f"graph {named:+.6g}"
+    if not b:
+        coupling: Coupling = {coupling_term: ((weight * a,),) for coupling_term, weight in weights.items()}
+        surds: Mapping[CouplingTerm, Surd] = {}
+        if mode.weight_error and mode.surd:
+            surd = mode.surd
+            surds = {
+                coupling_term: replace(surd, scale=weight * surd.scale)
+                for coupling_term, weight in weights.items()
+            }
+        return ModalSystem(name, mode.multiplicity, (group,), coupling, weight_errors, surds)
+    pair = {
+        coupling_term: ((weight * a, -weight * b), (weight * b, weight * a))
+        for coupling_term, weight in weights.items()
+    }
+    subsystems = tuple(replace(group, name=part) for part in ("real", "imaginary"))
+    return ModalSystem(f"{name} ± {mode.value.imag:.6g}i", mode.multiplicity, subsystems, pair, weight_errors)

@@ -1,0 +1,381 @@
+"""Modal decomposition: a complete system as few and small independent loops.
+
+Takes: the groups of equal peers of a model, and the links between them.
+Gives: `split`; `ModalDecomposition`, `decompose`; `orthogonal_loops`; `complete_loops`, `dense_loop`,
+`dense`, `refuse_dense`, `split_exchangeable`; `couple`, `complete_degrees`.
+Guarantees: the systems of a split, each with its multiplicity, have together the spectrum of `dense`, for any
+number of peers. Weights are exact; a mean over no peers, or with weights that sum to 0, raises an error.
+Does not: compute eigenvalues (see `spectrum`); find symmetries of different peers other than a permutation of
+two.
+
+On a complete graph a peer of group g receives r = c_g (Σ_j s_j − s_own), with c_g = 1/(others) for a mean and
+1 for a sum. K groups of n_1 … n_K equal peers then split exactly:
+
+    common        all peers of a group in phase: r_g = c_g Σ_h (n_h − δ_gh) s_h         once
+    difference g  peers of group g with sum zero, all others at rest: r_g = −c_g s_g     n_g − 1 times
+
+For equal peers on any other graph see `graph_loops`. Different peers on such a graph are one system, reduced
+by interchangeable peers: g and h of equal dynamics whose weights to and from all others are equal. A class c
+of n_c interchangeable peers with self-weight w_own and mutual weight w_other splits in two: the common motion
+is that of one subsystem that receives w_own + (n_c − 1) w_other times its own packets and n_d W_cd times
+those of class d; in the difference modes, with sum zero and all others at rest, each peer receives w_own −
+w_other times its own packets, n_c − 1 times.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from fractions import Fraction
+
+from apc.compiler.weights import exact_weight
+from apc.lifting.numeric_model import PeerIndices
+from apc.spectrum.graph_loops import common_graph, graph_loop, graph_scale
+from apc.spectrum.graph_modes import graph_modes
+from apc.spectrum.interconnection import ClosedLoop, Coupling, ModalSystem, close_loop
+from apc.spectrum.peer_classes import PeerClass, group_name, states_of, too_large, used_coupling_terms
+from apc.support.not_supported import NotSupportedError
+from apc.support.state_limits import MATRIX_STATES
+from apc.timing.communication_graph import CommunicationGraph, check_mean
+from apc.timing.schedule import CouplingTerm
+
+# The mode family of peers that differ.
+COUPLED = "coupled"
+
+
+@dataclass(frozen=True, slots=True)
+class ModalDecomposition:
+    """A complete system as independent loops; `method` is "modes" or "dense", `notes` give the reason."""
+
+    method: str
+    loops: tuple[ModalSystem, ...]
+    notes: tuple[str, ...]
+
+
+def split(groups: Sequence[PeerClass], exchange: CommunicationGraph) -> tuple[ClosedLoop, ...]:
+    """Return the complete system as the smallest closed loops that its graphs and groups allow.
+
+    Parameters
+    ----------
+    groups
+        All peers (see `peer_classes.peer_groups`).
+    exchange
+        The links.
+
+    Raises
+    ------
+    ApcError
+        E801, E802 an undefined mean; E804 one system of too many states.
+    """
+    loops = decompose(groups, exchange).loops
+    for loop in loops:
+        if loop.states > MATRIX_STATES:
+            raise too_large(exchange, f"{exchange.peers:,} peers", loop.states)
+    return tuple(close_loop(loop) for loop in loops)
+
+
+def decompose(groups: Sequence[PeerClass], exchange: CommunicationGraph) -> ModalDecomposition:
+    """Return the independent loops of a complete system, before their matrices are built (see `split`).
+
+    Parameters
+    ----------
+    groups, exchange
+        As for `split`.
+    """
+    coupling_terms = used_coupling_terms(group.schedule for group in groups)
+    graphs = list(
+        dict.fromkeys(
+            coupling_term.link
+            for coupling_term in coupling_terms
+            if not exchange.is_complete(coupling_term.link)
+        )
+    )
+    if not graphs:
+        return ModalDecomposition("modes", complete_loops(groups, exchange), ())
+    named = " and ".join(f"{link} ({exchange.links[link].graph.shape})" for link in graphs)
+    reason = f"the peers on {named} differ" if len(groups) > 1 else common_graph(coupling_terms, exchange)
+    if not reason:
+        scale = graph_scale(groups[0], coupling_terms, exchange)
+        modes = graph_modes(exchange.links[graphs[0]].graph, exchange.peers, mean=scale.by_mean)
+        if modes is not None:
+            note = f"{len(modes)} subsystems, one for each eigenvalue of the graph of {named}"
+            return ModalDecomposition(
+                "modes", tuple(graph_loop(groups[0], graph_mode, scale) for graph_mode in modes), (note,)
+            )
+        reason = f"the graph of {named} has no full set of eigenvectors"
+    parts = split_exchangeable(dense_loop(groups, exchange), exchange)
+    if len(parts) > 1:
+        note = f"{len(parts)} subsystems (common and difference motions of interchangeable peers)"
+        return ModalDecomposition("modes", parts, (note,))
+    return ModalDecomposition("dense", parts, (f"all peers as one system: {reason}",))
+
+
+def orthogonal_loops(
+    groups: Sequence[PeerClass], exchange: CommunicationGraph, most: int
+) -> tuple[ModalSystem, ...]:
+    """Return a model as orthogonal loops, the common loop first.
+
+    Parameters
+    ----------
+    groups, exchange
+        As for `split`.
+    most
+        The limit of peers on a graph that is not complete.
+
+    Raises
+    ------
+    NotSupportedError
+        More peers on such a graph than the limit.
+    """
+    graphs = {coupling_term.link for coupling_term in used_coupling_terms(group.schedule for group in groups)}
+    graphs = {link for link in graphs if not exchange.is_complete(link)}
+    if not graphs:
+        return complete_loops(groups, exchange)
+    count = sum(group.count for group in groups)
+    if count > most:
+        raise NotSupportedError(f"{count:,} peers on a graph that is not complete; the limit is {most}")
+    if len(groups) == 1 and all(exchange.links[link].graph.shape == "ring" for link in graphs):
+        arrangement = decompose(groups, exchange)
+        if arrangement.method == "modes":
+            return arrangement.loops
+    return split_exchangeable(dense_loop(groups, exchange), exchange)
+
+
+def complete_loops(groups: Sequence[PeerClass], exchange: CommunicationGraph) -> tuple[ModalSystem, ...]:
+    """Return a common loop, and a difference loop for each group of two or more peers, on complete graphs.
+
+    Parameters
+    ----------
+    groups
+        All peers (see `peer_classes.peer_groups`).
+    exchange
+        The links, all of them complete.
+    """
+    degrees = complete_degrees(groups, exchange)
+    weights = couple(
+        groups,
+        exchange,
+        lambda coupling_term, g, h: Fraction(groups[h].count - (1 if g == h else 0)),
+        degrees,
+    )
+    loops = [ModalSystem(_mode_family(groups), 1, tuple(groups), weights)]
+    if all(group.count < 2 for group in groups):
+        return tuple(loops)
+    separation = couple(groups, exchange, lambda coupling_term, g, h: Fraction(-1 if g == h else 0), degrees)
+    for index, group in enumerate(groups):
+        if group.count < 2:
+            continue
+        own_weights = {key: ((rows[index][index],),) for key, rows in separation.items()}
+        name = "difference" if len(groups) == 1 else f"difference {group.name}"
+        loops.append(ModalSystem(name, group.count - 1, (group,), own_weights))
+    return tuple(loops)
+
+
+def dense(groups: Sequence[PeerClass], exchange: CommunicationGraph) -> ClosedLoop:
+    """Return the closed loop of all peers of the system, as a reference; its cost is N³.
+
+    Parameters
+    ----------
+    groups
+        All peers (see `peer_classes.peer_groups`).
+    exchange
+        The links.
+
+    Raises
+    ------
+    ApcError
+        E801, E802 an undefined mean; E804 more than `MATRIX_STATES` states.
+    """
+    refuse_dense(groups, exchange)
+    return close_loop(dense_loop(groups, exchange))
+
+
+def refuse_dense(groups: Sequence[PeerClass], exchange: CommunicationGraph) -> None:
+    """Raise ApcError E804 for a dense system with too many states, before any peer is evaluated."""
+    states = sum(group.count * states_of(group.schedule, group.jacobians) for group in groups)
+    if states > MATRIX_STATES:
+        raise too_large(exchange, f"{exchange.peers:,} peers", states)
+
+
+def dense_loop(groups: Sequence[PeerClass], exchange: CommunicationGraph) -> ModalSystem:
+    """Return all peers of the system as one loop, one subsystem per peer."""
+    all_peers = tuple(
+        replace(group, name=exchange.peer_name(peer), count=1, peers=PeerIndices((range(peer, peer + 1),)))
+        for peer, group in sorted(
+            ((peer, group) for group in groups for peer in group.peers), key=lambda pair: pair[0]
+        )
+    )
+    weights = {
+        link: {
+            (receiver, sender): exact_weight(weight)
+            for (sender, receiver), weight in zip(*(arc.tolist() for arc in exchange.arcs(link)), strict=True)
+        }
+        for link in exchange.links
+    }
+    degrees: dict[tuple[str, int], Fraction] = {}
+    for link, entries in weights.items():
+        for (receiver, sender), weight in entries.items():
+            if all_peers[sender].sends(link):
+                degrees[link, receiver] = degrees.get((link, receiver), Fraction(0)) + weight
+    coupling = couple(
+        all_peers,
+        exchange,
+        lambda coupling_term, g, h: weights[coupling_term.link].get((g, h), Fraction(0)),
+        degrees,
+    )
+    return ModalSystem(COUPLED, 1, all_peers, coupling)
+
+
+def _mode_family(subsystems: Sequence[PeerClass]) -> str:
+    """Return the mode family: "single" for one peer, "common" for equal peers, "coupled" for
+    different peers.
+    """
+    return COUPLED if len(subsystems) > 1 else "common" if subsystems[0].count > 1 else "single"
+
+
+def split_exchangeable(loop: ModalSystem, exchange: CommunicationGraph) -> tuple[ModalSystem, ...]:
+    """Return a loop split by its interchangeable peers.
+
+    Parameters
+    ----------
+    loop
+        A loop of all peers, one per subsystem, with exact weights; without interchangeable peers it is
+        returned unchanged.
+    exchange
+        The links, for the names of the groups.
+    """
+    classes: list[list[int]] = []
+    for index in range(len(loop.subsystems)):
+        interchangeable = (members for members in classes if _are_exchangeable(loop, members[0], index))
+        matching_class = next(interchangeable, None)
+        if matching_class is None:
+            classes.append([index])
+        else:
+            matching_class.append(index)
+    if loop.weight_errors or len(classes) == len(loop.subsystems):
+        return (loop,)
+    subsystems = tuple(
+        _merged_class([loop.subsystems[index] for index in members], exchange) for members in classes
+    )
+    coupling = {
+        coupling_term: tuple(
+            tuple(_class_weight(loop, coupling_term, members, others) for others in classes)
+            for members in classes
+        )
+        for coupling_term in loop.coupling
+    }
+    loops = [replace(loop, name=_mode_family(subsystems), subsystems=subsystems, coupling=coupling)]
+    for subsystem, members in zip(subsystems, classes, strict=True):
+        if len(members) > 1:
+            first, second = members[:2]
+            separation = {
+                coupling_term: ((rows[first][first] - rows[first][second],),)
+                for coupling_term, rows in loop.coupling.items()
+            }
+            multiplicity = loop.multiplicity * (len(members) - 1)
+            loops.append(ModalSystem(f"difference {subsystem.name}", multiplicity, (subsystem,), separation))
+    return tuple(loops)
+
+
+def _are_exchangeable(loop: ModalSystem, g: int, h: int) -> bool:
+    """Return whether an exchange of the subsystems g and h leaves the loop unchanged."""
+    subsystem, other = loop.subsystems[g], loop.subsystems[h]
+    if subsystem.lifting is not other.lifting or subsystem.schedule is not other.schedule:
+        return False
+    remaining = [index for index in range(len(loop.subsystems)) if index not in (g, h)]
+    return all(
+        rows[g][g] == rows[h][h]
+        and rows[g][h] == rows[h][g]
+        and all(rows[g][k] == rows[h][k] and rows[k][g] == rows[k][h] for k in remaining)
+        for rows in loop.coupling.values()
+    )
+
+
+def _class_weight(
+    loop: ModalSystem, coupling_term: CouplingTerm, receivers: Sequence[int], senders: Sequence[int]
+) -> Fraction:
+    """Return the sum of the weights with which a subsystem receives all subsystems of a class.
+
+    `receivers` and `senders` are the indices of the subsystems of two classes; all receivers of a class have
+    the same sum.
+    """
+    row = loop.coupling[coupling_term][receivers[0]]
+    return sum((row[index] for index in senders), Fraction(0))
+
+
+def _merged_class(subsystems: Sequence[PeerClass], exchange: CommunicationGraph) -> PeerClass:
+    """Return equal subsystems as one class of peers."""
+    peers = PeerIndices(tuple(run for subsystem in subsystems for run in subsystem.peers.runs))
+    return replace(subsystems[0], name=group_name(peers, exchange), count=len(peers), peers=peers)
+
+
+def couple(
+    groups: Sequence[PeerClass],
+    exchange: CommunicationGraph,
+    weigh: Callable[[CouplingTerm, int, int], Fraction],
+    degrees: Mapping[tuple[str, int], Fraction],
+) -> Coupling:
+    """Return the coupling weights between subsystems, for each coupling term.
+
+    Parameters
+    ----------
+    groups
+        The subsystems.
+    exchange
+        The links.
+    weigh
+        Returns the weight of a packet of subsystem h at subsystem g in a plain sum.
+    degrees
+        The divisors of a mean, by link and subsystem, without entries for peers that receive nothing.
+    """
+    coupling = {}
+    for coupling_term in used_coupling_terms(group.schedule for group in groups):
+        rows = []
+        for g, group in enumerate(groups):
+            receives = any(received.coupling_term == coupling_term for received in group.schedule.received)
+            if receives and coupling_term.operator == "mean":
+                total = degrees.get((coupling_term.link, g))
+                check_mean(
+                    exchange,
+                    group.peers.first,
+                    coupling_term.link,
+                    "mean",
+                    total is not None,
+                    total or Fraction(0),
+                )
+            row = []
+            for h, sender in enumerate(groups):
+                weight = (
+                    weigh(coupling_term, g, h)
+                    if receives and sender.sends(coupling_term.link)
+                    else Fraction(0)
+                )
+                if (
+                    weight
+                    and exchange.delay(coupling_term.link, sender.delay_class, group.delay_class)
+                    == coupling_term.delay
+                ):
+                    if coupling_term.operator == "mean":
+                        weight /= degrees[coupling_term.link, g]
+                    elif coupling_term.operator in ("max", "min"):  # the one that is split off counts once
+                        weight = Fraction(1 if weight > 0 else -1)
+                    row.append(weight * group.gain(coupling_term, sender))
+                else:
+                    row.append(Fraction(0))
+            rows.append(tuple(row))
+        coupling[coupling_term] = tuple(rows)
+    return coupling
+
+
+def complete_degrees(
+    groups: Sequence[PeerClass], exchange: CommunicationGraph
+) -> dict[tuple[str, int], Fraction]:
+    """Return the number of other peers from which a peer of each group receives, for each complete link."""
+    degrees = {}
+    for link in exchange.links:
+        total = sum(group.count for group in groups if group.sends(link))
+        for g, group in enumerate(groups):
+            number = total - (1 if group.sends(link) else 0)
+            if number:
+                degrees[link, g] = Fraction(number)
+    return degrees

@@ -1,0 +1,1 @@
+"""Many verdicts: margins, critical values, sensitivities, sweeps, comparison of schemes."""

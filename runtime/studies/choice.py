@@ -1,0 +1,171 @@
+"""Selection of the stiffness, delay and loss of a model for a comparison.
+
+Takes: a `Model`, and names given by the user.
+Gives: `SweepChoice`, `choose`, `check_over`; `STIFFNESS`, `DELAY`, `LOSS`.
+Guarantees: the selection is by structure (units and communication graph), never by names. An ambiguous choice
+is left empty.
+Does not: vary parameters (see `studies.critical_values`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+from apc.compiler.compiled import Model
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
+from apc.network.nominal_criterion import channel_numbers
+from apc.parameter_values.parameter_names import ParameterRef, find, times_of, unit_of
+from apc.parameter_values.parameters import scope_of
+from apc.studies.margins import STIFFNESSES
+
+STIFFNESS, DELAY, LOSS = "stiffness", "delay", "loss"
+
+_LOCATION = SourceLocation("--over")
+
+
+@dataclass(frozen=True, slots=True)
+class SweepChoice:
+    """The varied parameter, by its command-line name; "" if none, with the reason in `why`."""
+
+    name: str
+    why: str = ""
+
+
+def check_over(systems: Sequence[Model], over: Iterable[str]) -> None:
+    """Raise ApcError for a name that is unknown to all models, or that is not a stiffness, delay or loss.
+
+    Parameters
+    ----------
+    systems
+        The models.
+    over
+        The names given.
+
+    Raises
+    ------
+    ApcError
+        E622 no model has the parameter, E940 the parameter is another quantity.
+    """
+    for name in over:
+        errors: list[ApcError] = []
+        for system in systems:
+            try:
+                _axis(system, find(system, name, _LOCATION))
+            except ApcError as error:
+                errors.append(error)
+        if len(errors) == len(systems):
+            raise errors[0]
+
+
+def choose(system: Model, over: Sequence[str]) -> dict[str, SweepChoice]:
+    """Return the stiffness, delay and loss of a model to be varied.
+
+    Named parameters have priority. The defaults are the stiffness of the coupler that receives from other
+    peers, and the delay and loss of its link. If a default is computed from other parameters, these are
+    returned instead.
+
+    Parameters
+    ----------
+    system
+        The model.
+    over
+        Names of the varied parameters; names unknown in this model are ignored.
+
+    Raises
+    ------
+    ApcError
+        E941 the choice is ambiguous.
+    """
+    names_by_axis: dict[str, list[str]] = {STIFFNESS: [], DELAY: [], LOSS: []}
+    for name in over:
+        try:
+            parameter_ref = find(system, name, _LOCATION)
+            names_by_axis[_axis(system, parameter_ref)].append(parameter_ref.label)
+        except ApcError:
+            continue  # a parameter of another model, see `check_over`
+    return {
+        axis: _only(system, axis, names_by_axis[axis] or _default_names(system, axis))
+        for axis in names_by_axis
+    }
+
+
+def _axis(system: Model, parameter_ref: ParameterRef) -> str:
+    """Return the role of a parameter: stiffness, delay or loss.
+
+    Raises ApcError (E940) for other quantities.
+    """
+    if times_of(system, parameter_ref.name):
+        return DELAY
+    if parameter_ref.name in channel_numbers(system):
+        return LOSS
+    unit = unit_of(system, parameter_ref.name)
+    if unit in STIFFNESSES:
+        return STIFFNESS
+    if unit == "s":
+        return DELAY
+    message = f"{parameter_ref.label} of {system.name}"
+    raise ApcError(
+        Diagnostic("E940", _LOCATION, message, "a stiffness, a delay or a loss", f"a quantity in {unit}")
+    )
+
+
+def _default_names(system: Model, axis: str) -> list[str]:
+    """Return the parameters that can be varied by default as the stiffness, delay or loss."""
+    received = {
+        receive.link
+        for peer_type in system.peer_types
+        for clock in peer_type.clocks
+        for receive in clock.receives
+    }
+    links = [link for link in system.links if link.name in received]
+    if axis == DELAY:
+        return _roots(system, [link.delay for link in links], ("s",))
+    if axis == LOSS:
+        losses = [link.channel.loss for link in links if link.channel is not None]
+        return _roots(system, [loss.p for loss in losses if loss is not None], ("1",))
+    receiving_parts = {
+        channel.rpartition(".")[0]
+        for peer_type in system.peer_types
+        for send in peer_type.sends
+        if send.link in received
+        for channel in send.channels
+    }
+    stiff = [parameter.name for parameter in system.parameters if parameter.unit in STIFFNESSES]
+    return _roots(system, [name for name in stiff if name.rpartition(".")[0] in receiving_parts], STIFFNESSES)
+
+
+def _roots(system: Model, names: Iterable[str], units: Sequence[str]) -> list[str]:
+    """Return the parameters without formula that determine some parameters, with one of the given units.
+
+    A parameter without formula determines itself.
+    """
+    scope = scope_of(system)
+    needed = scope.needed(list(names))
+    return [
+        name
+        for name in scope.holder
+        if name in needed - set(scope.formulas) and unit_of(system, name) in units
+    ]
+
+
+def _only(system: Model, axis: str, names: Sequence[str]) -> SweepChoice:
+    """Return the only name, or the reason if there is none. Raises ApcError (E941) for several names."""
+    if len(names) > 1:
+        message = f"has {len(names)} parameters that could be compared as {axis}: {', '.join(names)}"
+        raise ApcError(
+            Diagnostic("E941", SourceLocation(system.origin.topology), message, fix=f"--over {names[0]}")
+        )
+    return SweepChoice(names[0]) if names else SweepChoice("", _nothing(system, axis))
+
+
+def _nothing(system: Model, axis: str) -> str:
+    """Return the reason why no stiffness, delay or loss of a model can be varied."""
+    if axis == STIFFNESS:
+        return "no stiffness of a coupler between peers (choose another with --over NAME)"
+    if not system.links:
+        return "there is no link"
+    if axis == DELAY:
+        return "no peer receives over a link"
+    names = " and ".join(link.name for link in system.links)
+    return f"no link has a loss; write loss: 0 % at {names} to vary it"

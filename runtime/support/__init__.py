@@ -1,0 +1,1 @@
+"""Processes, files, memory limits and the table of extensions: no domain knowledge."""

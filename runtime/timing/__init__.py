@@ -1,0 +1,1 @@
+"""Instants of events: clocks, schedules of a frame, the communication graph."""
