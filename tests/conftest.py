@@ -4,7 +4,9 @@ None depends on another either, or on what the user keeps: they run in several p
 
 A test marked `whole` runs with `pytest --whole` only: it is slow, or about the inside of a deep proof. One
 marked `few(count)` has more cases than its claim needs each time: so many of them run, chosen to show as many
-values of each parameter as they can, and all of them with `pytest --whole`.
+values of each parameter as they can, and all of them with `pytest --whole`. One marked
+`needs_extension(name, …)` does not run where one of these extensions, or any of `all`, is hidden
+(`pytest --without-extension NAME`).
 """
 
 from __future__ import annotations
@@ -12,13 +14,18 @@ from __future__ import annotations
 import gc
 import shlex
 import signal
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, settings
 
+from apc.support.extension_table import EXTENSIONS, FOLDER
 from tests.commands import Cli, Ran
+from tests.hidden import HiddenExtensions
+
+HIDDEN = pytest.StashKey[set[str]]()
 
 # How long an example takes, or the making of one, says nothing of whether a claim is true.
 settings.register_profile("apc", deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -44,10 +51,40 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
         "--whole", action="store_true", help="run every test, and every case of those marked few"
     )
+    parser.addoption(
+        "--without-extension",
+        action="append",
+        default=[],
+        help="hide an extension, or `all`, and run the tests that need none of the hidden ones",
+    )
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Hide extensions from import."""
+    names = config.getoption("--without-extension")
+    config.stash[HIDDEN] = {*EXTENSIONS} if "all" in names else {*names}
+    if config.stash[HIDDEN]:
+        sys.meta_path.insert(0, HiddenExtensions(config.stash[HIDDEN]))
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Ignore a file of tests that imports a hidden extension."""
+    if not config.stash[HIDDEN] or collection_path.suffix != ".py":
+        return None
+    text = collection_path.read_text(encoding="utf-8")
+    return any(f"from {FOLDER}.{name}" in text for name in config.stash[HIDDEN]) or None
 
 
 @pytest.hookimpl(trylast=True)  # of what is selected otherwise
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    missing = {
+        item
+        for item in items
+        for mark in item.iter_markers("needs_extension")
+        if not config.stash[HIDDEN].isdisjoint(EXTENSIONS if "all" in mark.args else mark.args)
+    }
+    config.hook.pytest_deselected(items=[item for item in items if item in missing])
+    items[:] = [item for item in items if item not in missing]
     if config.getoption("--whole"):
         return
     marked: dict[str, tuple[int, list[pytest.Function]]] = {}

@@ -13,7 +13,7 @@ from typing import Any
 
 import flint
 
-from apc.eigen.ball_arithmetic import precision
+from apc.spectrum.ball_arithmetic import precision
 
 BITS = 200
 CERTAIN = 1e-40  # so far, and no more, an eigenvalue may be off

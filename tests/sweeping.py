@@ -33,7 +33,7 @@ _WAITING = """\
 import signal, sys, time
 from apc.__main__ import run
 from apc.cli import progress
-from apc.sweeps.finished_parts import SweepParts
+from apc.studies.finished_parts import SweepParts
 signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored by what a shell starts in the background
 progress.QUIET = float('inf')
 kept, write = [], SweepParts.write

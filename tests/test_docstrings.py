@@ -21,7 +21,7 @@ FOLDERS = {"compiler": ROOT / "compiler", "": ROOT / "runtime"}  # of the packag
 
 
 def _module(path: Path) -> str:
-    """Return the name of a file's module below `apc`: `frame.lift`, `compiler.errors`."""
+    """Return the name of a file's module below `apc`: `lifting.lift`, `compiler.errors`."""
     folder = "compiler" if path.is_relative_to(FOLDERS["compiler"]) else ""
     parts = [folder, *path.relative_to(FOLDERS[folder]).with_suffix("").parts]
     return ".".join(part for part in parts if part and part != "__init__")

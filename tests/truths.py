@@ -22,7 +22,7 @@ from typing import Any
 import flint
 
 import apc
-from apc.eigen.ball_arithmetic import precision
+from apc.spectrum.ball_arithmetic import precision
 from tests.bruteforce import TopologySource, as_ball, frame_matrix
 from tests.fifty_digits.truth import RIGID, spectral_truth
 from tests.reference import MIDPOINT_RADIUS, OPERATORS
@@ -36,12 +36,12 @@ LIBRARY = sorted((ROOT / "models" / "topologies").glob("*.yaml")) + sorted(
 
 # Linearizations of which no truth is to be had event by event, and why; they are played by hand elsewhere.
 UNTOLD = {
-    "carried-beam": "hold functions whose values are rounded",
-    "god-object": "hold functions whose values are rounded",
+    "carried-beam": "contain functions whose values are rounded",
+    "god-object": "contain functions whose values are rounded",
     "limited-motor": "is not linear",
     "three-users-scheduled": "looks at each sender by itself",
     "two-users-passivity": "not linear in what it hears",
-    "two-users-set-position": "hold functions whose values are rounded",
+    "two-users-set-position": "contain functions whose values are rounded",
 }
 
 
@@ -133,7 +133,7 @@ couplers:
 
 
 CLOSED = [
-    # m dv/dt = −b v over the frame of 1 s of a topology without clocks; a position that nothing holds.
+    # m dv/dt = −b v over the frame of 1 s of remove clocks; a position that nothing holds.
     _closed("a damped mass", ONE_MASS, lambda: (-flint.arb(3) / 2).exp(), 1, TRANSLATING),
     _closed(
         "a light one",

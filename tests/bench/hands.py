@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Any
 
 import apc
-from apc.optional import need
 from apc.output.pictures import COLOURS, write_figure
 from apc.output.region_picture import PANEL
+from apc.support.optional import need
 from tests.bench.judge import Judge, decided, parser_of
 from tests.topologies import AVERAGE, MESH, compiled, replaced
 
@@ -57,7 +57,7 @@ def required(judge: Judge, name: str, hands: str) -> list[float]:
 
 
 def used(judge: Judge, name: str) -> tuple[list[float], list[float]]:
-    """Return what the network adds to the damping of each copy in N·s/m, and copies apart in mm a newton."""
+    """Return the network damping of each copy in N·s/m, and the coordination error in mm/N."""
     viscous, apart = [], []
     for peers in PEERS:
         found = apc.transparency(topology(TOPOLOGIES[name], peers, STIFFNESS), frequencies=[0.1])
@@ -82,10 +82,10 @@ def picture(curves: Curves) -> Any:
         first.plot(PEERS, mesh, "--s", color=colour, ms=4, mfc="none")
         first.plot(PEERS, even, "o", color=colour, ms=9, mfc="none")
     titles = {
-        "viscous": f"(b) viscosity of the network, felt at\neach copy at {STIFFNESS:.0f} N/m [N·s/m]",
-        "apart": "(c) copies apart for a slow push,\nthe same [mm/N]",
+        "viscous": f"(b) network damping at\neach copy, {STIFFNESS:.0f} N/m [N·s/m]",
+        "apart": "(c) coordination error of a slow push,\nthe same [mm/N]",
     }
-    first.set_title("(a) stiffness borne [N/m]", fontsize=9)
+    first.set_title("(a) largest stable stiffness [N/m]", fontsize=9)
     for ax, (what, title) in zip(others, titles.items(), strict=True):
         ax.plot(PEERS, curves["average", what], "-o", color="#000000", ms=4)
         ax.plot(PEERS, curves["mesh", what], "--s", color="#000000", ms=4, mfc="none")
@@ -112,7 +112,7 @@ def main() -> None:
         for name in TOPOLOGIES:
             curves |= {(name, hands): required(judge, name, hands) for hands in HANDS}
             curves[name, "viscous"], curves[name, "apart"] = used(judge, name)
-        print("stiffness borne with hands [N/m]; viscosity of the network [N*s/m], copies apart [mm/N]")
+        print("largest stable stiffness with hands [N/m]; network damping [N*s/m], coordination error [mm/N]")
         for (name, what), values in curves.items():
             listed = "  ".join(f"{n} users {v:.4f}" for n, v in zip(PEERS, values, strict=True))
             print(f"  {name:<8} {what:<8} {listed}")

@@ -148,7 +148,7 @@ def decided(parser: argparse.ArgumentParser) -> Iterator[tuple[Judge, argparse.N
     """Give a judge and what the command line says, one core's worth of threads, and end the program."""
     import numpy as np  # not by who measures processes: one begins as a copy
 
-    from apc.threads import single_threaded
+    from apc.support.threads import single_threaded
 
     given = parser.parse_args()
     judge = Judge(given.strict)

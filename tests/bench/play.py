@@ -13,14 +13,14 @@ from time import process_time
 
 import apc
 from apc.compiler.compiled import Model
-from apc.frame.communication_graph import build_exchange
-from apc.frame.parameters import resolve
 from apc.output.realtime_output import ticks_text
+from apc.parameter_values.parameters import resolve
 from apc.realtime.peer import PeerLoop
 from apc.realtime.peer_run import RealtimeRun
 from apc.realtime.run_comparison import compare_run
 from apc.realtime.start import LocalRun, run_all
 from apc.simulation.output_blocks import forces_in_time
+from apc.timing.communication_graph import build_exchange
 from tests.bench.judge import decided, parser_of
 from tests.topologies import AVERAGE, TOPOLOGIES, compiled, replaced
 

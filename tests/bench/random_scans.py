@@ -14,7 +14,7 @@ from fractions import Fraction
 import numpy as np
 
 import apc
-from apc.threads import single_threaded
+from apc.support.threads import single_threaded
 from apc.verdict import ProofMethod
 from tests.bench.by_hand import Floats
 from tests.bench.judge import decided, parser_of

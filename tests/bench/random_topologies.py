@@ -26,11 +26,11 @@ from apc.benchmark.timing import timed
 from apc.compiler.compiled import Model
 from apc.compiler.components.component_library import Library
 from apc.compiler.errors import ApcError
-from apc.eigen.ball_arithmetic import precision
-from apc.frame.numeric_model import prepare
-from apc.frame.overrides import apply
+from apc.lifting.numeric_model import numeric_model
+from apc.parameter_values.overrides import apply
 from apc.simulation.simulation import ROW
-from apc.threads import single_threaded
+from apc.spectrum.ball_arithmetic import precision
+from apc.support.threads import single_threaded
 from tests.bench.judge import decided, parser_of
 from tests.bench.sensitivity_truth import check_frequencies, check_sensitivities
 from tests.bench.shapes import PARTS, draw_shape, numbers
@@ -111,7 +111,7 @@ def _looked_into(system: Model, found: Analysis) -> list[str]:
     if found.stable is None and found.spectral_radius == 1:
         return []  # a motion that grows with t² leaves an eigenvalue 1, which the reference takes for a translation
     try:
-        told = sensitivities_of(system, prepare(system), found)
+        told = sensitivities_of(numeric_model(system), found)
         return [check_sensitivities(system, told), check_frequencies(found)]
     except Exception as error:  # whatever it is, it is a bug
         return [repr(error)]
@@ -145,7 +145,7 @@ def run(points: int, *, seed: int = 0, methods: Sequence[str] = ("auto",), draws
 def _analysed(system: Model, method: str, due: str, look: bool, tally: Tally) -> list[str]:
     """Analyse a topology, take it down in the tally, and return what is wrong; `due` is the error it must give."""
     try:
-        used, found = timed(partial(analyze, system, method=method))
+        used, found = timed(partial(analyze, numeric_model(system), method=method))
     except ApcError as error:
         code = error.mistakes[0].code
         tally.as_they_must += code == due

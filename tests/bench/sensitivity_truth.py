@@ -21,11 +21,11 @@ import numpy as np
 
 from apc.analysis.analysis import Analysis, analyze
 from apc.compiler.compiled import Model
-from apc.eigen.ball_arithmetic import precision
-from apc.frame.numeric_model import prepare
-from apc.frame.overrides import Override, apply
-from apc.frame.parameter_names import find, parameter_of
-from apc.parameter_studies.sensitivity import Sensitivities, sensitivities
+from apc.lifting.numeric_model import numeric_model
+from apc.parameter_values.overrides import Override, apply
+from apc.parameter_values.parameter_names import find, parameter_of
+from apc.spectrum.ball_arithmetic import precision
+from apc.studies.sensitivity import Sensitivities, sensitivities
 from tests.bench.shapes import PARTS, draw_shape
 from tests.fifty_digits.events import Happening, build_peers, refusal
 from tests.fifty_digits.truth import RIGID, _common_whom, _difference_whom, _from_state, _to_state, classes_of
@@ -62,7 +62,7 @@ def check_sensitivities(system: Model, found: Analysis | Sensitivities) -> str:
 
     Of an analysis the radius is compared with theirs.
     """
-    printed = found if isinstance(found, Sensitivities) else sensitivities(system)
+    printed = found if isinstance(found, Sensitivities) else sensitivities(numeric_model(system))
     if isinstance(found, Analysis) and printed.active:
         apart = abs(printed.radius - found.spectral_radius)
         if not apart <= 1e-9 + found.spectral_radius_error:
@@ -91,7 +91,7 @@ def check_sensitivities(system: Model, found: Analysis | Sensitivities) -> str:
 
 def _matrices(system: Model) -> list[Any]:
     """Return the frame matrices of all closed systems."""
-    frame = prepare(system).schedules[0].frame_s
+    frame = numeric_model(system).schedules[0].frame_s
     return [_whole_map(one, frame) for one in _happenings(system)]
 
 
@@ -224,7 +224,7 @@ def run(points: int, *, seed: int = 0) -> list[str]:
     for _ in range(points):
         text = topology(generator)
         system = compiled(text)
-        found = analyze(system)
+        found = analyze(numeric_model(system))
         wrong += [
             f"{one}\n{text}" for one in (check_sensitivities(system, found), check_frequencies(found)) if one
         ]

@@ -18,8 +18,8 @@ from dataclasses import dataclass, replace
 from fractions import Fraction
 
 from apc.compiler.compiled import Model
-from apc.frame.overrides import Override
-from apc.frame.parameter_names import ParameterRef
+from apc.parameter_values.overrides import Override
+from apc.parameter_values.parameter_names import ParameterRef
 from tests.fuzz.grammar import grown, rules_of
 
 # Least and largest decade, and the chance of 0.

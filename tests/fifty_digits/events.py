@@ -30,10 +30,10 @@ import numpy as np
 
 from apc.compiler.compiled import Model, PeerType
 from apc.compiler.interpolation import jacobian
-from apc.eigen.ball_arithmetic import rational_ball
-from apc.frame.exact_arithmetic import evaluate_exact, is_rational
-from apc.frame.jacobians import guards_of
-from apc.frame.parameters import exact_numbers, resolve
+from apc.linearization.jacobians import guards_of
+from apc.parameter_values.exact_arithmetic import evaluate_exact, is_rational
+from apc.parameter_values.parameters import exact_numbers, resolve
+from apc.spectrum.ball_arithmetic import rational_ball
 
 Number = Any  # flint.arb, an exact 0 or 1, or an array of these
 
@@ -95,7 +95,7 @@ def refusal(system: Model, *, in_time: bool) -> str:
     for peer_type in (peer_type.linear or peer_type for peer_type in system.peer_types):
         functions = [*(c.tick for c in peer_type.clocks), *(s.send for s in peer_type.sends)]
         if not all(map(is_rational, functions)) or not _has_exact_slopes(peer_type.derivative):
-            return f"the equations of {peer_type.name} hold functions whose values are rounded"
+            return f"the equations of {peer_type.name} contain functions whose values are rounded"
         if any(receive.edge is not None for clock in peer_type.clocks for receive in clock.receives):
             return f"{peer_type.name} looks at each sender by itself"
         if any(r.operator not in ("mean", "sum") for clock in peer_type.clocks for r in clock.receives):

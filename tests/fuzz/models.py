@@ -33,13 +33,13 @@ from apc.compiler.cache import FORMAT, Origin
 from apc.compiler.errors import ApcError
 from apc.compiler.pipeline import compile_topology
 from apc.compiler.store import model_of
-from apc.inputs import load_fresh
-from apc.processes import digest_of
+from apc.inputs.open_model import load_fresh
 from apc.realtime.peer import PeerLoop
 from apc.realtime.peer_run import run_of, write_run
 from apc.realtime.run_comparison import compare_run
 from apc.realtime.run_folder import read_run
-from apc.sweeps.finished_parts import open_parts
+from apc.studies.finished_parts import open_parts
+from apc.support.processes import digest_of
 from tests.fuzz.inputs import MODELS, Input, any_value, mutated
 from tests.fuzz.networks import ask_network, make_network, whole_networks
 from tests.fuzz.trees import Pairs, Tree, as_json, changed, of_json

@@ -168,7 +168,7 @@ def _wrong(noise: random.Random, here: _Topology, _: _Topology) -> Forgery:
     }
     sort = noise.choice(list(bodies))
     body = bodies[sort][: None if noise.random() < 0.8 else noise.randrange(20)]
-    return post._sealed(sort, whole(), body, post.keys[0] if sort == DATA else SECRET), other.address
+    return post._datagram(sort, whole(), body, post.keys[0] if sort == DATA else SECRET), other.address
 
 
 FORGED: dict[str, Callable[[random.Random, _Topology, _Topology], Forgery]] = {
@@ -177,7 +177,7 @@ FORGED: dict[str, Callable[[random.Random, _Topology, _Topology], Forgery]] = {
         noise.choice(here.others).address,
     ),
     "torn": _torn,
-    "heard before": _again,
+    "duplicate": _again,
     "of an earlier session": lambda noise, _, earlier: noise.choice(earlier.given),
     "this peer's own": _local,
     "sealed without the secret": _guessed,

@@ -127,10 +127,10 @@ def test_nothing_in_it_changes_but_what_is_given(tmp_path: Path) -> None:
     assert included == {f'#include "{code.identifier}.h"', "#include <math.h>"}
 
 
-def test_the_loop_of_the_readme_compiles(tmp_path: Path) -> None:
+def test_the_loop_of_the_manual_compiles(tmp_path: Path) -> None:
     topology = str(TOPOLOGIES / "experiment-average.yaml")
     assert run(["export", topology, "--peer", "left[1]", "--out", str(tmp_path / "left.c")]) == 0
-    text = (ROOT / "runtime" / "exports" / "README.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs" / "howto" / "export.md").read_text(encoding="utf-8")
     _, _, after = text.partition("<!-- compiled with left.h of experiment-average.yaml -->\n```c\n")
     (tmp_path / "loop.c").write_text(after.partition("```")[0], encoding="ascii")
     subprocess.run(
@@ -158,13 +158,13 @@ def test_numbers_of_any_size_and_none_do_no_harm(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "method", "device", "message"),
     [
-        (BENT, "", None, "E961 user[1]: device and stop may be devices, or copies that its computer moves. "
-                         "Write: --device device,stop or --device device"),
-        (BENT, "", "device", "E960 user[1]: between ticks cube.x, cube.v move by CVODES, which is not "
-                             "written as C. Write: --method rk4:0.1ms"),
-        (MOVED, "", "box", "E961 --device: no mass of user[1] is called box. Write: --device cube"),
-        (TIED, "", None, "E961 user[1]: device and cube are tied to each other between ticks: no computer "
-                         "can move cube where device moves by itself."),
+        (BENT, "", None, "E961 user[1]: device and stop may be devices or object copies. "
+                         "Try: --device device,stop, or --device device"),
+        (BENT, "", "device", "E960 user[1]: cube.x, cube.v are integrated by CVODES between ticks, "
+                             "which is not exported to C. Try: --method rk4:0.1ms"),
+        (MOVED, "", "box", "E961 --device: unknown mass 'box' of user[1]. Try: --device cube"),
+        (TIED, "", None, "E961 user[1]: device and cube are coupled between ticks, so cube can't be "
+                         "computed while device is a physical device. Connect them by a part with a clock"),
     ],
 )  # fmt: skip
 def test_what_it_cannot_hold_is_named(text: str, method: str, device: str | None, message: str) -> None:

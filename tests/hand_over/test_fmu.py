@@ -286,19 +286,19 @@ def test_another_program_is_not_given_another_topology(fmpy: Any, tmp_path: Path
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["topology.fmu"], "E960 user[1]: between ticks cube.x, cube.v move by CVODES"),
-        (["peer.c"], 'E963 --peer: the peers differ, and a text of C is of one. Write: --peer "user[1]"'),
+        (["topology.fmu"], "E960 user[1]: cube.x, cube.v are integrated by CVODES between ticks"),
+        (["peer.c"], 'E963 the peers differ; C code is written for one peer. Try: --peer "user[1]"'),
         (
             ["peer.c", "--peer", "user[4]"],
-            'E970 a peer wants one of user[1], user[2], user[3], got user[4]. Write: --peer "user[1]"',
+            'E970 peer: expected one of user[1], user[2], user[3], got user[4]. Try: --peer "user[1]"',
         ),
         (
             ["topology.fmu", "--peer", "usr[1]"],
-            'E970 a peer wants one of user[1], user[2], user[3], got usr[1]. Write: --peer "user[1]"',
+            'E970 peer: expected one of user[1], user[2], user[3], got usr[1]. Try: --peer "user[1]"',
         ),
         (
             ["topology.fmu", "--device", "device"],
-            "E953 --device means nothing to the format fmu. Write: --to c",
+            "E953 --device has no effect for the format fmu. Try: --to c",
         ),
     ],
 )
@@ -309,7 +309,9 @@ def test_what_cannot_be_is_told_and_nothing_is_written(
 
 
 def test_more_ways_than_fit_a_text_are_refused() -> None:
-    with pytest.raises(ApcError, match="E960 200 peers hear each other on 39,800 ways; 20,000 fit"):
+    with pytest.raises(
+        ApcError, match="E960 200 peers have 39,800 directed connections; the limit of the C export is 20,000"
+    ):
         topology_unit(compiled(replaced(AVERAGE, ("count: 3", "count: 200"))))
 
 
@@ -329,9 +331,9 @@ def test_without_a_compiler_there_is_a_message_and_no_archive(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("apc.exports.fmu.compiler", lambda: None)
-    with pytest.raises(ApcError, match=r"E962 no C compiler answers"):
+    with pytest.raises(ApcError, match=r"E962 no C compiler found"):
         written(PAPER, tmp_path)
     monkeypatch.setattr("apc.exports.fmu.compiler", lambda: ("/bin/false", ""))
-    with pytest.raises(ApcError, match=r"E962 /bin/false doesn't compile it"):
+    with pytest.raises(ApcError, match=r"E962 /bin/false failed to compile the code"):
         written(PAPER, tmp_path)
     assert not list(tmp_path.iterdir())

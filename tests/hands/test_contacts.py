@@ -63,7 +63,7 @@ def test_the_experiment_with_the_mean_is_stable_in_contact_and_with_the_mesh_it_
         assert len(json.loads(json.dumps(found.to_dict(), allow_nan=False))["modes"]) == 4
         assert max(map(len, str(found).splitlines())) <= 80
     none = apc.contact_modes(compiled(AVERAGE))
-    assert (none.parts, str(none)) == ((), "three-users-average: no part switches")
+    assert (none.parts, str(none)) == ((), "three-users-average: no contact")
     with warnings.catch_warnings(action="error"):  # of what is beyond floats
         assert apc.contact_modes(wall(0.1, 1.0, 0.0, 1e200)).parts == ("it.push",)
 
@@ -104,7 +104,7 @@ def test_a_piece_that_is_not_linear_is_taken_at_the_start_or_refused_there() -> 
     pressed = pressed.replace("3900 N/m, damping: 0.05 N*s/m", "3900 N/m^(3/2), damping: 0.05 N*s/m^(5/2)")
     every, apart, *_ = apc.contact_modes(compiled(pressed)).modes
     assert apart.stable is False and every.stable is None
-    assert "right is not linear and has no slope at the start values" in every.refusal
+    assert "right is not linear and has no slope at the initial values" in every.refusal
     # Ten millimetres deep, the slope of 3900 d^1.5 is 5850 · 0.1 N/m.
     deep = apc.contact_modes(compiled(pressed.replace("30 mm", "10 mm"))).modes[0]
     interchangeable = replaced(EXPERIMENTS["average"], ("3900 N/m, damping: 0.05", "585 N/m, damping: 5e-5"))
@@ -162,5 +162,5 @@ def test_each_kind_of_decision_has_the_slopes_of_its_pieces(
 
 def test_a_part_that_decides_too_much_is_refused(tmp_path: Path) -> None:
     law = " + ".join(f"max(0, k*d - {step}*k*most)" for step in range(7))
-    with pytest.raises(ApcError, match=r"E863 it.f of user takes 7 decisions; at most 6"):
+    with pytest.raises(ApcError, match=r"E863 it.f of user has 7 conditions; at most 6"):
         apc.contact_modes(compiled(TOPOLOGY, library(tmp_path, OWN.format(law=law))))

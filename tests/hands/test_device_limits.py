@@ -109,6 +109,6 @@ def test_what_a_clock_computes_can_have_no_limit(tmp_path: Path) -> None:
     text = replaced(PLANAR, ("flange: device}", "flange: device, clock: tick}"))
     [line] = told(compiled, text, library(tmp_path, part))
     assert line.partition("yaml:")[2] == (
-        "5:13: E513 eye.seen[1] has a limit and is computed at ticks;"
-        " a limit is of what holds at every moment. Write: acting = hold(seen), with the limit of acting"
+        "5:13: E513 limit of eye.seen[1]: expected a continuous variable, got one computed at ticks. "
+        "Add acting = hold(seen) and declare the limit of acting."
     )

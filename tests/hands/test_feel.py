@@ -15,6 +15,7 @@ import apc
 from apc.__main__ import run
 from apc.compiler.errors import ApcError
 from apc.haptics.frequency_response import transparency
+from apc.lifting.numeric_model import numeric_model
 from tests.hands.handled import responses
 from tests.topologies import AVERAGE, MESH, ONE_MASS, TOPOLOGIES, compiled, replaced
 
@@ -45,7 +46,7 @@ def test_responses_are_those_of_one_dense_system_of_all_users(count: int, ring: 
         masses = np.linspace(0.08, 0.13, count)
         text = unlike(masses, text)
     hertz = (0.7, 2.9, 9.7, 21.7, 58.3)
-    found = transparency(compiled(text), hertz, alongside=())
+    found = transparency(numeric_model(compiled(text)), hertz, alongside=())
     for place, one in enumerate(hertz):
         here, there, apart = responses(masses, 300.0, one, ring=ring)
         assert found.impedance[place] == pytest.approx(1 / here, rel=1e-9)
@@ -81,6 +82,7 @@ PUBLISHED = (
 )
 
 
+@pytest.mark.needs_extension("system_norms")
 @pytest.mark.few(1)
 @pytest.mark.parametrize(("count", "used", "arrives", "apart", "alias", "ticks", "sampled", "rms"), PUBLISHED)
 def test_numbers_of_an_independent_program(
@@ -105,6 +107,7 @@ def test_numbers_of_an_independent_program(
     assert error is not None and off is not None and abs(error - rms) <= off < 1e-10 * rms
 
 
+@pytest.mark.needs_extension("system_norms")
 def test_a_lone_mass_feels_like_itself() -> None:
     """No tick, no network: Z = b + jωm."""
     idle = "{type: SampledSpringDamper, a: device, b: ground, stiffness: 0 N/m, clock: tick}"
@@ -129,13 +132,16 @@ def test_a_lone_mass_feels_like_itself() -> None:
         assert hands.velocity_m_s is not None and hands.errors[1] is not None
         assert abs(mpmath.mpf(hands.velocity_m_s) - truth) <= hands.errors[1] < 1e-11 * truth
     # It is the rms at the ticks, which is not that over time.
-    assert "rms at the ticks, motion between ticks not included" in " ".join(str(found).split())
-    assert found.to_dict()["h2_rms"] == "at the ticks, motion between ticks not included"
+    assert "white noise, at clock ticks (motion between ticks is not included)" in " ".join(
+        str(found).split()
+    )
+    assert found.to_dict()["h2_rms"] == "at clock ticks (motion between ticks is not included)"
 
 
 RING = replaced(MESH, ("delay: 8 ms}", "delay: 8 ms, graph: ring}"))
 
 
+@pytest.mark.needs_extension("system_norms")
 @pytest.mark.few(2)
 @pytest.mark.parametrize("count", [2, 3, 5])
 @pytest.mark.parametrize(("text", "received"), [(AVERAGE, 1), (MESH, 4), (RING, 2)])
@@ -178,6 +184,7 @@ def test_noise_of_groups_whose_forces_switch_at_other_times(
         assert one.velocity_m_s == pytest.approx(velocity, rel=1e-8)
 
 
+@pytest.mark.needs_extension("system_norms")
 def test_an_unstable_topology_has_no_response_in_time_but_its_map_has_one() -> None:
     found = apc.transparency(compiled(users(3, 1200)), [1.0], unstable=True)
     below = apc.transparency(compiled(users(3, 1090)), [1.0])
@@ -211,11 +218,11 @@ TOOL = (TOPOLOGIES / "two-handed-tool.yaml").read_text(encoding="utf-8")
         (AVERAGE, [1.0], "contact", "E936"),
         (AVERAGE, [1.0], "user[4].device", r'--at "user\[3\].device"'),
         (AVERAGE, [1.0], "usr[2].device", r'--at "user\[2\].device"'),
-        (ONE_MASS, [1.0], "", "E935 the topology has nothing that ticks, .* Write: a coupler with a clock"),
+        (ONE_MASS, [1.0], "", "E935 the topology has no clock; .* Use a coupler with a clock"),
         (BARE, [1.0], "", "E931"),
-        (TOOL, [1.0], "", r"E931 left moves with masses .*, and a hand may hold any of them \(user\)\.$"),
+        (TOOL, [1.0], "", r"E931 left is coupled to masses .*, so the device is not unique \(user\)\.$"),
         (users(3, 1200), [1.0], "", "E934"),
-        (unlike(np.linspace(0.08, 0.13, 50), users(50, 300)), [1.0], "", "E933 .* 50 peers that differ"),
+        (unlike(np.linspace(0.08, 0.13, 50), users(50, 300)), [1.0], "", "E933 .* 50 different peers"),
     ],
 )
 def test_what_can_t_be_felt_is_refused(text: str, frequency: list[float], at: str, why: str) -> None:
@@ -239,22 +246,23 @@ def test_what_can_t_be_felt_is_refused(text: str, frequency: list[float], at: st
 def test_the_first_device_is_held_along_its_first_direction_which_is_said(
     name: str, at: str, others: tuple[str, ...]
 ) -> None:
-    found = transparency(apc.compile(TOPOLOGIES / f"{name}.yaml"), [1.0], alongside=())
+    found = transparency(numeric_model(apc.compile(TOPOLOGIES / f"{name}.yaml")), [1.0], alongside=())
     assert (found.at, tuple(map(str, found.notes))) == (at, others)
 
 
 def test_in_a_plane_a_hand_feels_along_each_axis_what_it_feels_on_a_line() -> None:
     plane, line = (
         apc.compile(TOPOLOGIES / "planar-users.yaml"),
-        transparency(compiled(AVERAGE), [1.0, 10.0], alongside=()),
+        transparency(numeric_model(compiled(AVERAGE)), [1.0, 10.0], alongside=()),
     )
     for axis in ("x[1]", "x[2]"):
-        found = transparency(plane, [1.0, 10.0], at=f"user[1].device.{axis}", alongside=())
+        found = transparency(numeric_model(plane), [1.0, 10.0], at=f"user[1].device.{axis}", alongside=())
         assert (found.between, found.object) == (f"user[2].device.{axis}", "cube")
         for name in ("impedance", "transmitted_admittance", "coordination_error"):
             np.testing.assert_allclose(getattr(found, name), getattr(line, name), rtol=1e-9, atol=1e-12)
 
 
+@pytest.mark.needs_extension("system_norms")
 def test_copies_of_another_object_are_none_of_those_that_a_copy_differs_from() -> None:
     """Two pairs that nothing couples: each feels what it feels without the other."""
     text = replaced(users(2, 300), (", shared: true", ""))
@@ -265,7 +273,9 @@ def test_copies_of_another_object_are_none_of_those_that_a_copy_differs_from() -
     for pair in zip(parts.splitlines(), more.splitlines(), strict=True):
         both = replaced(both, (pair[0], "\n".join(pair)))
     both = replaced(both, ("links:", "links:\n  lan_b: {clock: network, delay: 8 ms}"))
-    apart, together = (transparency(compiled(item), [1.0, 10.0], alongside=("h2",)) for item in (text, both))
+    apart, together = (
+        transparency(numeric_model(compiled(item)), [1.0, 10.0], alongside=("h2",)) for item in (text, both)
+    )
     np.testing.assert_allclose(together.coordination_error, apart.coordination_error, rtol=1e-9)
     assert [item.error_m for item in together.h2] == pytest.approx([item.error_m for item in apart.h2])
 
@@ -297,12 +307,13 @@ def test_the_command_line_says_what_python_does(
         (1, "E935", "--to", "600 Hz"),
         (1, "E935", "--from", "2 Hz", "--to", "1 Hz"),
         (1, "E878", "--out", "bode.txt"),
-        (1, "got none. Write: --out /dev/stdout\n", "--out", "-"),
-        (2, "names every frequency there is: no --from with it", "--frequencies", "1 Hz", "--from", "1 Hz"),
+        (1, "got none. Try: --out /dev/stdout\n", "--out", "-"),
+        (2, "--frequencies can't be combined with --from", "--frequencies", "1 Hz", "--from", "1 Hz"),
         (2, "", "--at", "user[3]", "--between", "user[1]:user[2]"),
         (2, "", "--nyquist", "--out", "table.csv"),
     ):
         assert why in printed(*wrong, code=code)
-    assert "noise" in printed("--frequencies", "1 Hz", "--set", "haptic.phase=0.3 ms").splitlines()[1]
-    lossy = transparency(apc.compile(TOPOLOGIES / "lossy-average.yaml"), [1.0], alongside=())
+    expected = "no response to noise, as the fastest clock has a phase"
+    assert expected in printed("--frequencies", "1 Hz", "--set", "haptic.phase=0.3 ms")
+    lossy = transparency(numeric_model(apc.compile(TOPOLOGIES / "lossy-average.yaml")), [1.0], alongside=())
     assert "packet loss" in str(lossy).splitlines()[1]

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import apc
-from apc.frame.parameter_names import ParameterRef, Range
+from apc.extensions.wall_conditions.overlay import overlay_points, parse_overlay, symbol_values
 from apc.haptics.wall_conditions import CONDITIONS
-from apc.regions.overlay import overlay_points, parse_overlay, symbol_values
+from apc.parameter_values.parameter_names import ParameterRef, Range
 from tests.topologies import AVERAGE, compiled, told, wall
 
 
@@ -91,7 +91,8 @@ def test_symbols_follow_the_topology_its_expressions_and_groups() -> None:
     words = "colgate:K=contact.stiffness,B=0 N*s/m,b=a.device.damping,T=haptic.period"
     assert symbol_values(model, parse_overlay(model, words)) == (900.0, 7.0, 0.0, 0.001)
     assert told(parse_overlay, model, words.replace("a.device", "device")) == [
-        "overlay: E886 device.damping differs between peers, and b is one number. Write: b=a.device.damping"
+        "overlay: E886 device.damping differs between peers, but b is a single number. "
+        "Try: b=a.device.damping"
     ]
 
 
@@ -101,21 +102,20 @@ EXAMPLE = "colgate:K=contact.stiffness,B=contact.damping,b=device.damping,T=hapt
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("colgate", f"E886 an overlay wants CONDITION:SYMBOL=NAME,…, got colgate. Write: {EXAMPLE}"),
+        ("colgate", f"E886 overlay: expected CONDITION:SYMBOL=NAME,…, got colgate. Try: {EXAMPLE}"),
         (
             "colgat:K=it.stiffness",
-            "E886 colgat is no published condition known here (colgate, gil, diolaiti, abbott). "
-            "Write: colgate",
+            "E886 colgat is not a known condition (colgate, gil, diolaiti, abbott). Try: colgate",
         ),
-        ("colgate:K", f"E886 a symbol wants SYMBOL=NAME, got K. Write: {EXAMPLE}"),
+        ("colgate:K", f"E886 symbol: expected SYMBOL=NAME, got K. Try: {EXAMPLE}"),
         ("colgate:Q=it.stiffness", "E886 b > K T/2 + |B| has no Q; it has K, b, B, T."),
         ("colgate:K=it.stiffness,K=1 N/m", "E886 K is given twice."),
-        ("colgate:K=it.stifness", "E622 it.stifness is no parameter of wall. Write: it.stiffness"),
+        ("colgate:K=it.stifness", "E622 it.stifness is not a parameter of wall. Try: it.stiffness"),
         (
             "colgate:K=it.damping",
-            "E204 K, the stiffness of the virtual wall, wants N/m, got it.damping in N*s/m.",
+            "E204 K, the stiffness of the virtual wall: expected N/m, got it.damping in N*s/m.",
         ),
-        ("colgate:T=1", "E204 T wants ms, got 1 (no unit). Write: T: 1 ms"),
+        ("colgate:T=1", "E204 T: expected ms, got 1 (no unit). Try: T: 1 ms"),
     ],
 )
 def test_a_faulty_overlay_gets_one_clear_message(text: str, message: str) -> None:

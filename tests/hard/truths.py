@@ -13,7 +13,7 @@ from typing import Any
 
 from apc.compiler.compiled import Model
 from apc.compiler.pipeline import compile_topology
-from apc.eigen.ball_arithmetic import precision
+from apc.spectrum.ball_arithmetic import precision
 from tests.fifty_digits.truth import RIGID, Truth, classes_of, eigenvalues, frame_matrices, spectral_truth
 
 HERE = Path(__file__).resolve().parent

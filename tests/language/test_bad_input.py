@@ -52,54 +52,60 @@ def nested(opened: str, closed: str, depth: int) -> str:
 BOMB = "x0: &b0 [1, 1, 1, 1, 1, 1, 1, 1, 1, 1]\n" + "".join(
     f"x{i}: &b{i} [{', '.join([f'*b{i - 1}'] * 10)}]\n" for i in range(1, 10)
 )
-DEEP = "E328 this is nested or chained more than 100 deep: give a part of it a name."
-LIST = "1:1: E203 a topology wants a mapping of keys to values, got a list. Write: topology: my-topology"
-TABBED = "a tab indents this line, and YAML allows spaces only. Write: spaces"
-NO_TEXT = "E107 a YAML file wants visible text, got "
-NO_PLACE = "E109 this line belongs to nothing above it: its indent or a closing bracket is wrong."
+DEEP = "E328 the expression is nested more than 100 levels deep; give a subexpression a name."
+LIST = "1:1: E203 topology: expected a mapping of keys to values, got a list. Try: topology: my-topology"
+TABBED = "indentation: expected spaces, got a tab."
+NO_TEXT = "E107 file: expected text without control characters, got "
+NO_PLACE = "E109 unexpected line: wrong indentation, or an unmatched closing bracket."
 FILES: list[tuple[str | bytes, str]] = [
-    ("", "E108 this file is empty."),
-    ("# nothing\n\n", "E108 this file is empty."),
+    ("", "E108 the file is empty."),
+    ("# nothing\n\n", "E108 the file is empty."),
     ("- a\n- b\n", LIST),
     ("just text\n", LIST.replace("a list", "just text")),
-    ("topology: [a\nmasses: {", "1:11: E109 this [ is never closed, or a comma is missing behind it."),
+    ("topology: [a\nmasses: {", "1:11: E109 this [ is not closed, or a comma is missing after it."),
     ("{a: 1}}\n", f"1:7: {NO_PLACE}"),
     (" a: 1\nb: 2\n", f"2:1: {NO_PLACE}"),
-    ("? [a]\n: b\n", "1:3: E112 a key wants a name, got a list."),
-    ("a: 'x\n", "1:4: E109 this quote is never closed."),
-    ("a: @x\n", "1:4: E109 a text starting with @ needs quotes. Write: '@x'"),
-    ("a: b: c\n", "1:5: E109 a ': ' cannot stand here: the line above ends wrongly"),
-    ("a: {x: O[1], y: 1}\n", '1:8: E109 a text with [ in it needs quotes here. Write: "O[1]"'),
-    ("a: [r = {1, 2}]\n", '1:5: E109 a text with { in it needs quotes here. Write: "r = {1, 2}"'),
-    ("a: {x: [1] [2]}\n", "1:4: E109 this { is never closed, or a comma is missing behind it."),
-    ("{a: \n", "2:1: E109 a value or a closing bracket is missing here."),
+    ("? [a]\n: b\n", "1:3: E112 key: expected a name, got a list."),
+    ("a: 'x\n", "1:4: E109 this quote is not closed."),
+    ("a: @x\n", "1:4: E109 text that starts with @ needs quotes. Try: '@x'"),
+    ("a: b: c\n", "1:5: E109 unexpected ': ': the line above is incomplete"),
+    ("a: {x: O[1], y: 1}\n", '1:8: E109 text with [ needs quotes here. Try: "O[1]"'),
+    ("a: [r = {1, 2}]\n", '1:5: E109 text with { needs quotes here. Try: "r = {1, 2}"'),
+    ("a: {x: [1] [2]}\n", "1:4: E109 this { is not closed, or a comma is missing after it."),
+    ("{a: \n", "2:1: E109 expected a value or a closing bracket."),
     ("a: 1\n\tb: 2\n", f"2:1: E109 {TABBED}"),
-    ("a: 1\nb\nc: 2\n", "2:1: E109 a key stands here without its colon and a space. Write: b:"),
+    ("a: 1\nb\nc: 2\n", "2:1: E109 expected a colon and a space after this key. Try: b:"),
     ("a:\n  b: 1\n c: 2\n", "3:2: E109 this line is indented differently from the keys it belongs to."),
-    ("x: !mine 3", "1:4: E113 the tag '!mine' is not part of this language."),
-    ("x: !!int y", "1:4: E113 !!int wants such a value, got 'y'."),
-    ("a: &one 1\nb: *ome", "2:4: E114 *ome has no &ome before it. Write: *one"),
-    (f"{AVERAGE}---\na: 1\n", "18:1: E110 a file wants one YAML document, got the start of a second one."),
-    (AVERAGE + BOMB, "22:45: E117 this file has more than 100000 nodes, aliases written out."),
-    (nested("[", "]", 200), "18:67: E115 this is nested deeper than 64 levels."),
-    (nested("{a: ", "}", 200), "18:256: E115 this is nested deeper than 64 levels."),
-    (f"a: &a {'[' * 40}{']' * 40}\nb: {'[' * 30}*a{']' * 30}", "2:34: E115 this is nested deeper than 64"),
+    ("x: !mine 3", "1:4: E113 the tag '!mine' is not supported."),
+    ("x: !!int y", "1:4: E113 !!int: expected a value of this type, got 'y'."),
+    (
+        "a: &one 1\nb: *ome",
+        "2:4: E114 the alias *ome has no anchor &ome before it. Try: *one",
+    ),
+    (f"{AVERAGE}---\na: 1\n", "18:1: E110 file: expected one YAML document, got the start of a second one."),
+    (AVERAGE + BOMB, "22:45: E117 the file has more than 100000 nodes, aliases expanded."),
+    (nested("[", "]", 200), "18:67: E115 nested more than 64 levels deep."),
+    (nested("{a: ", "}", 200), "18:256: E115 nested more than 64 levels deep."),
+    (f"a: &a {'[' * 40}{']' * 40}\nb: {'[' * 30}*a{']' * 30}", "2:34: E115 nested more than 64 levels deep"),
     ("x: 'a\u2028'", f"1:6: {NO_TEXT}U+2028 (LINE SEPARATOR)."),
     (b"a: \x00", f"1:4: {NO_TEXT}U+0000 (a control character), as in a binary file."),
     (b"\x7fELF\x02\x01\x01\x00\x00", f"1:1: {NO_TEXT}U+007F"),
-    (b"\x89PNG\r\n\x1a\n", "1:1: E106 a YAML file wants UTF-8 text, got byte 0x89 at offset 0."),
-    (b"a: 1\nb: \xe4\n", "2:4: E106 a YAML file wants UTF-8 text, got byte 0xe4 at offset 8."),
-    (b"\xef\xbb\xbfa: \xff", "1:4: E106 a YAML file wants UTF-8 text, got byte 0xff at offset 6."),
-    (b"x" * ((1 << 20) + 1), "E105 this file is larger than 1048576 bytes, the most a YAML file may have"),
+    (b"\x89PNG\r\n\x1a\n", "1:1: E106 file: expected UTF-8 text, got byte 0x89 at offset 0."),
+    (b"a: 1\nb: \xe4\n", "2:4: E106 file: expected UTF-8 text, got byte 0xe4 at offset 8."),
+    (b"\xef\xbb\xbfa: \xff", "1:4: E106 file: expected UTF-8 text, got byte 0xff at offset 6."),
+    (b"x" * ((1 << 20) + 1), "E105 the file is larger than 1048576 bytes, the limit for a YAML file"),
     (stiffness(f"'{'(' * 3000}500{')' * 3000}'"), f"13:167: {DEEP}"),
     (stiffness(f"'{'-' * 3000}500'"), f"13:167: {DEEP}"),
     (stiffness(f"'{'abs(' * 1900}1{')' * 1900}'"), f"13:467: {DEEP}"),
     (stiffness(f"'{'+'.join('1' * 200)}'"), f"13:67: {DEEP}"),
     (stiffness(f"'{'if 1<2 then 1 else ' * 400}2'"), f"13:1934: {DEEP}"),
-    (stiffness(f"'{'1 + ' * 5000}1'"), "13:67: E328 an expression wants at most 10000 characters"),
-    (stiffness(f"'{'1' * 1001}*peers'"), "13:67: E323 a number wants at most 1000 characters, got 1001."),
-    (stiffness(f"{'1' * 201} N/m"), "13:66: E221 stiffness wants N/m, got 11111"),
-    (AVERAGE.replace("count: 3", f"count: {'9' * 5000}"), "7:17: E208 count wants a whole number from 1 to"),
+    (stiffness(f"'{'1 + ' * 5000}1'"), "13:67: E328 expression: expected at most 10000 characters"),
+    (stiffness(f"'{'1' * 1001}*peers'"), "13:67: E323 number: expected at most 1000 characters, got 1001."),
+    (stiffness(f"{'1' * 201} N/m"), "13:66: E221 stiffness: expected N/m, got 11111"),
+    (
+        AVERAGE.replace("count: 3", f"count: {'9' * 5000}"),
+        "7:17: E208 count: expected a whole number from 1 to",
+    ),
 ]
 
 
@@ -121,7 +127,7 @@ def test_every_command_says_the_same_and_writes_nothing(command: str, text: str,
 
 def test_a_mistake_behind_carriage_returns_and_a_mark_is_told_at_its_place(message: Say) -> None:
     FILE.write_bytes(("\ufeff" + stiffness("500").replace("\n", "\r\n")).encode())
-    assert message("check", "topology.yaml").startswith("topology.yaml:13:66: E204 stiffness wants N/m")
+    assert message("check", "topology.yaml").startswith("topology.yaml:13:66: E204 stiffness: expected N/m")
 
 
 @pytest.mark.parametrize("text", [AVERAGE.replace("\n", "\r\n"), "\ufeff" + AVERAGE, AVERAGE.rstrip("\n")])
@@ -143,7 +149,7 @@ def test_numbers_are_those_of_yaml_1_2(text: str, count: int) -> None:
 @pytest.mark.parametrize("word", ["on", "off", "yes", "y", "tRUE", "1", "~"])
 def test_what_yaml_1_1_would_convert_stays_a_word(word: str, message: Say) -> None:
     FILE.write_text(replaced(AVERAGE, ("shared: true", f"shared: {word}")), encoding="utf-8")
-    assert "E203 shared wants true or false, got" in message("check", "topology.yaml")
+    assert "E203 shared: expected true or false, got" in message("check", "topology.yaml")
 
 
 def test_keys_that_stand_twice_are_told_together_and_mistakes_in_the_order_of_the_file(
@@ -170,7 +176,8 @@ def test_the_line_is_shown_with_a_caret_under_the_place_however_long_it_is(
     FILE.write_text(replaced(AVERAGE, ("haptic: 1 ms", "haptic: 1 kg")), encoding="utf-8")
     assert run(["check"]) == 1
     assert capsys.readouterr().err == (
-        "topology.yaml:4:11: E204 haptic wants ms, got 1 kg.\n      haptic: 1 kg\n              ^\n"
+        "topology.yaml:4:11: E204 haptic: expected a time or a rate, got 1 kg. Try: haptic: 1 ms\n"
+        "      haptic: 1 kg\n              ^\n"
     )
     FILE.write_text(f"a: [{'b, ' * 100}!mine 1{', d' * 100}]", encoding="utf-8")
     assert run(["check", "topology.yaml"]) == 1
@@ -185,16 +192,24 @@ def test_the_line_is_shown_with_a_caret_under_the_place_however_long_it_is(
         (
             "compile",
             "topolog.yaml",
-            "topolog.yaml: E101 there is no such file; did you mean 'topology.yaml'?",
+            "topolog.yaml: E101 the file does not exist; did you mean 'topology.yaml'?",
         ),
-        ("compile", "zzz", "zzz: E101 there is no such file."),
-        ("compile", "no/a.yaml", "no/a.yaml: E101 there is no folder "),
+        ("compile", "zzz", "zzz: E101 the file does not exist."),
+        ("compile", "no/a.yaml", "no/a.yaml: E101 the folder "),
         ("compile", "topology.yaml/b", "topology.yaml/b: E101 "),
         ("compile", "x" * 5000, f"{'x' * 5000}: E10"),
-        ("compile", "topologies.yaml", "topologies.yaml: E102 this wants a YAML file, got a folder."),
+        ("compile", "topologies.yaml", "topologies.yaml: E102 input: expected a YAML file, got a folder."),
         ("analyze", "model.apc", "model.apc: E602 is a folder, not a compiled model."),
-        ("compile", "pipe.yaml", "pipe.yaml: E104 this wants a YAML file, got a device, pipe or socket."),
-        ("compile", "/dev/zero", "/dev/zero: E104 this wants a YAML file, got a device, pipe or socket."),
+        (
+            "compile",
+            "pipe.yaml",
+            "pipe.yaml: E104 input: expected a YAML file, got a device, pipe or socket.",
+        ),
+        (
+            "compile",
+            "/dev/zero",
+            "/dev/zero: E104 input: expected a YAML file, got a device, pipe or socket.",
+        ),
     ],
 )
 def test_a_file_that_can_not_be_read_is_told_and_nobody_waits_for_it(
@@ -221,7 +236,7 @@ def test_what_may_not_be_read_or_written_is_told(message: Say, folder: Path) -> 
     FILE.chmod(0)
     assert (
         message("compile", "topology.yaml")
-        == "topology.yaml: E103 this file may not be read (no permission)."
+        == "topology.yaml: E103 the file can't be read (permission denied)."
     )
 
 
@@ -237,16 +252,15 @@ def test_a_model_that_is_damaged_or_older_than_its_topology_is_refused(message: 
         assert "E604 is damaged" in message("analyze", "topology.apc")
     model.write_bytes(whole)
     assert apc.analyze(model).stable
-    assert "E614 is compiled already. Write: apc analyze" in message("compile", "topology.apc")
+    assert "E614 file is a compiled model. Try: apc analyze" in message("compile", "topology.apc")
     FILE.write_text(f"{AVERAGE}# more\n", encoding="utf-8")
     assert message("analyze", "topology.apc") == (
-        "topology.apc: E605 is stale: topology.yaml has changed since it was compiled. "
-        "Write: apc compile topology.yaml"
+        "topology.apc: E605 model is out of date: topology.yaml has changed. Try: apc compile topology.yaml"
     )
     FILE.unlink()
     assert apc.analyze(model).stable, "no topology there to be older than"
     model.write_bytes(b"garbage")
-    assert message("analyze", "topology.apc").endswith("Write: the file once more, from whoever made it")
+    assert message("analyze", "topology.apc").endswith("Obtain the file again from its author.")
 
 
 EACH = "peers: {user: {count: 3, set: {device.x: [0 m, 10 mm, 0 m]}}}"
@@ -255,19 +269,23 @@ EACH = "peers: {user: {count: 3, set: {device.x: [0 m, 10 mm, 0 m]}}}"
 @pytest.mark.parametrize(
     ("setting", "expected"),
     [
-        ("contact.stifness=1 N/m", "E622 contact.stifness is no parameter of three-users-average."),
-        ("contact.stiffness=1", "E204 contact.stiffness wants N/m, got 1 (no unit)."),
-        ("contact.stiffness=nan N/m", "E221 contact.stiffness wants N/m, got nan N/m."),
-        ("contact.stiffness", "E621 an override wants NAME=VALUE, got contact.stiffness."),
-        ("contact.stiffness=-1 N/m", "E624 contact.stiffness wants at least 0 N/m, got -1 N/m."),
-        ("contact.stiffness=9**9**9", "E222 a unit wants a name such as N, m or s, got ^."),
-        ("haptic.period=0 s", "E625 haptic.period wants a time above 0 s"),
+        ("contact.stifness=1 N/m", "E622 contact.stifness is not a parameter of three-users-average."),
+        ("haptic=2 ms", "E622 haptic is not a parameter of three-users-average. Try: haptic.period"),
+        ("contact.stiffness=1", "E204 contact.stiffness: expected N/m, got 1 (no unit)."),
+        (
+            "contact.stiffness=nan N/m",
+            "E221 contact.stiffness: expected a finite number in N/m, got nan N/m.",
+        ),
+        ("contact.stiffness", "E621 override: expected NAME=VALUE, got contact.stiffness."),
+        ("contact.stiffness=-1 N/m", "E624 contact.stiffness: expected at least 0 N/m, got -1 N/m."),
+        ("contact.stiffness=9**9**9", "E222 unit: expected a name such as N, m or s, got ^."),
+        ("haptic.period=0 s", "E625 haptic.period: expected a time above 0 s"),
         ("peers=4", "E623 peers is the number of all peers"),
-        ("cube.mass=0 kg", "E624 cube.mass wants more than 0 kg, got 0 kg."),
-        ("lan.delay=-1 ms", "E625 lan.delay wants a time of 0 s or more, got -1 ms."),
-        ("user.lan.delay=1 ms", "E622 user.lan.delay is no parameter of three-users-average"),
-        ("__class__.x=1", "E622 __class__.x is no parameter of three-users-average."),
-        ("user[2].device.x=10 mm", f"Write: {EACH}"),
+        ("cube.mass=0 kg", "E624 cube.mass: expected more than 0 kg, got 0 kg."),
+        ("lan.delay=-1 ms", "E625 lan.delay: expected a time of 0 s or more, got -1 ms."),
+        ("user.lan.delay=1 ms", "E622 user.lan.delay is not a parameter of three-users-average"),
+        ("__class__.x=1", "E622 __class__.x is not a parameter of three-users-average."),
+        ("user[2].device.x=10 mm", f"Try: {EACH}"),
     ],
 )
 def test_a_setting_that_cannot_be_is_one_message(setting: str, expected: str, message: Say) -> None:
@@ -280,7 +298,7 @@ def test_a_setting_that_cannot_be_is_one_message(setting: str, expected: str, me
 
 # ---- the topology that is meant ----
 
-NOTHING = "Write: apc new  (it writes a topology.yaml to start from)"
+NOTHING = "Try: apc new"
 
 
 @pytest.mark.whole
@@ -290,7 +308,7 @@ def test_the_only_topology_of_a_folder_is_the_one_that_is_meant(
     Path("part.yaml").write_text("component: Part\n", encoding="utf-8")
     Path("notes.txt").write_text("topology: no\n", encoding="utf-8")
     Path("folder.yaml").mkdir()
-    assert message("analyze") == f"this folder: E610 holds no topology and no compiled model. {NOTHING}"
+    assert message("analyze") == f"current folder: E610 no topology or compiled model. {NOTHING}"
     for start in ("", "\ufeff", "# mine\r\n"):
         FILE.write_text(start + AVERAGE, encoding="utf-8")
         assert run(["check"]) == 0
@@ -298,11 +316,12 @@ def test_the_only_topology_of_a_folder_is_the_one_that_is_meant(
     FILE.unlink()
     assert run(["analyze"]) == 0, "a model without its topology"
     capsys.readouterr()
-    assert message("compile") == f"this folder: E610 holds no topology. {NOTHING}"
+    assert message("compile") == f"current folder: E610 no topology. {NOTHING}"
     for name in ("b", "a"):
         Path(f"{name}.yaml").write_text(AVERAGE, encoding="utf-8")
     Path("topology.apc").unlink()
-    assert message("analyze") == "this folder: E611 holds 2 topologies: a.yaml, b.yaml. Write: apc … a.yaml"
+    expected = "current folder: E611 topologies: expected one, got 2. Try: a.yaml, or b.yaml"
+    assert message("analyze") == expected
 
 
 @pytest.mark.whole

@@ -90,7 +90,7 @@ def test_a_pair_of_peers_does_not_know_what_all_say_together(force: str, tmp_pat
     more = FOLLOWER.format(f"k*mean(others.x)', 'g = {force}").replace("hold(f)", "hold(f + g)")
     [line] = told(compiled, FOUR, library(tmp_path, more))
     assert "E506 sum(max(" in line
-    assert "asks of each other peer what depends on all that are heard" in line
+    assert "requests of each other peer a value that depends on all received values" in line
 
 
 # ---- an expression means in every place what a variable of its name means there ----

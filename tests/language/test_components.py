@@ -45,7 +45,7 @@ def test_a_bare_number_of_a_declaration_is_in_the_unit_beside_it(tmp_path: Path)
     [mass] = [one for one in system.parameters if one.name == "ball.mass"]
     assert (mass.minimum, mass.exclusive_minimum, mass.maximum, mass.value) == (0.001, True, 2.0, 0.5)
     [line] = told(compiled, text.replace("type: Ball", "type: Ball, mass: 1 g"), library(tmp_path, BALL))
-    assert line.endswith("E207 mass wants more than 1 g, got 1 g.")
+    assert line.endswith("E207 mass: expected more than 1 g, got 1 g.")
 
 
 @pytest.mark.parametrize(("other", "code"), [("2*flange.x/L*F", ""), ("flange.x", "E404")])

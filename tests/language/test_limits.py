@@ -30,16 +30,16 @@ def test_a_table_is_refused_by_its_size_before_it_is_read(tmp_path: Path) -> Non
     with (tmp_path / "users.csv").open("wb") as file:
         file.truncate((64 << 20) + 1)
     assert tabled(tmp_path, None) == [
-        "topology.yaml:7:17: E701 the table users.csv is larger than 64 MiB, the most it may have."
+        "topology.yaml:7:17: E701 the table users.csv is larger than the limit of 64 MiB."
     ]
 
 
-NUMBER = "E703 a cell wants a finite number, got"
+NUMBER = "E703 cell: expected a finite number, got"
 TABLES = [
-    (",".join(f"a{i} [kg]" for i in range(1001)), "1:1: E702 the table has 1001 columns, and 1000 are the "
-     "most. Write: several groups, each with a table"),
-    (f"device.mass [kg],{' ' * 100_000}[\n1,1\n", "1:18: E702 a heading wants a name and its unit"),
-    (f"device.mass [kg],{'[' * 100_000}\n1,1\n", "1:18: E702 a heading wants a name and its unit"),
+    (",".join(f"a{i} [kg]" for i in range(1001)), "1:1: E702 table: expected at most 1000 columns, got 1001. "
+     "Use several groups, each with a table."),
+    (f"device.mass [kg],{' ' * 100_000}[\n1,1\n", "1:18: E702 heading: expected a name and its unit"),
+    (f"device.mass [kg],{'[' * 100_000}\n1,1\n", "1:18: E702 heading: expected a name and its unit"),
     ('device.mass [kg],cube.mass [kg],device.x [m]\n\n1,"2\n",3\n4,x,6\n7,8,"9\n\n', f"5:3: {NUMBER} x."),
     ('device.mass [kg],cube.mass [kg]\n1,2\n,1\n', f"3:1: {NUMBER} nothing."),
     *((f"device.mass [kg]\n{cell}\n", f"2:1: {NUMBER} {cell}.")
@@ -75,17 +75,21 @@ def test_other_names_in_a_file_of_pairs_are_refused(tmp_path: Path, row: str) ->
     edges = (DELAY, "delay: 8 ms, graph: {edges: users.csv}}")
     [line] = tabled(tmp_path, f"from,to,weight\n{row}\n", edges)
     column = 1 + max(row.find("user"), 0)
-    assert line.startswith(f"users.csv:2:{column}: E703 a cell wants a finite number, or the name of a peer")
+    assert line.startswith(
+        f"users.csv:2:{column}: E703 cell: expected a finite number, or the name of a peer"
+    )
     assert "such as user[1]" in line
 
 
 def test_a_heading_without_end_is_told_in_a_few_words(tmp_path: Path) -> None:
     edges = (DELAY, "delay: 8 ms, graph: {edges: users.csv}}")
     [line] = tabled(tmp_path, f"from,to,{LONG}\n1,2,1\n", edges)
-    assert line.endswith(f"wants the headings from, to and weight or none, got from, to, {'a' * 47}...")
+    assert line.endswith(
+        f"expected the headings from, to and, optionally, weight, got from, to, {'a' * 47}..."
+    )
     push = "hands: {push: {type: TableForce, flange: device, force: users.csv}}\nlinks:"
     assert tabled(tmp_path, f"time [s],{LONG}\n0,1\n1,2\n", ("links:", push)) == [
-        f"users.csv:1:10: E702 {SHOWN} wants N, got 1."
+        f"users.csv:1:10: E702 {SHOWN}: expected N, got 1."
     ]
 
 
@@ -96,8 +100,8 @@ def test_the_delay_that_is_proposed_for_a_force_is_taken(requested: str, tmp_pat
         return tabled(tmp_path, "", ("haptic, delay: 1 ms}", f"haptic, delay: {delay}}}"))
 
     [message] = late(requested)
-    assert "values that are computed and do not act yet; at most 1,000 can be analysed" in message
-    assert late(message.split("Write: delay: ")[1].split(",")[0]) == []
+    assert "computed values that are not yet applied; the limit is 1,000" in message
+    assert late(message.split("Try: delay: ")[1].split(",")[0]) == []
     assert not model_size(apc.compile(tmp_path / "topology.yaml")).refused
 
 
@@ -110,17 +114,17 @@ def wrong(*pairs: tuple[str, str]) -> str:
 GROUPS = "".join(f"  g{i}: {{count: 1}}\n" for i in range(1001))
 UNLIKE = "".join(f"  g{i}: {{count: 1000000000, set: {{device.mass: {i + 1} kg}}}}\n" for i in range(300))
 MANY = ("count: 3", "count: 1000000000")
-ON_A_GRAPH = "E208 a graph wants at most 1,000,000 peers where it isn't complete, got 1,000,000,000."
+ON_A_GRAPH = "E208 graph: expected at most 1,000,000 peers unless complete, got 1,000,000,000."
 MUCH: list[tuple[tuple[tuple[str, str], ...], str]] = [
     ((("haptic: 1 ms", "haptic: 1/2003 s"), ("network: 8 ms", "network: 1/1999 s")),
-     "E805 3,998 packets of one peer in a frame, and 1000 are the most that are analysed"),
-    ((("  user: {count: 3}\n", GROUPS),), "E208 peers wants at most 1000 groups, got 1,001"),
+     "E805 3,998 packets of one peer in a frame; the limit is 1000"),
+    ((("  user: {count: 3}\n", GROUPS),), "E208 peers: expected at most 1000 groups, got 1,001"),
     ((("  user: {count: 3}\n", UNLIKE),),
-     "E804 300,000,000,000 peers, some of whom differ, and 20,000,000 are the most of these"),
+     "E804 300,000,000,000 peers, some of which differ; the limit for different peers is 20,000,000"),
     *(((MANY, (DELAY, f"delay: 8 ms, graph: {graph}}}")), ON_A_GRAPH)
       for graph in ("ring", "star", "{edges: [[1, 2], [2, 3]]}")),
-    ((("  cube:", "  more: {mass: 1 kg, count: 499}\n  cube:"),), "E804 1 different peers make one system of "
-     "1,002 states; the matrix of one may have 1,000."),
+    ((("  cube:", "  more: {mass: 1 kg, count: 499}\n  cube:"),), "E804 1 different peers form one system of "
+     "1,002 states; the limit is 1,000"),
 ]  # fmt: skip
 
 
@@ -137,13 +141,13 @@ def test_peers_on_a_complete_graph_have_no_limit() -> None:
 @pytest.mark.whole
 def test_delays_are_searched_and_varied_only_so_far() -> None:
     assert told(lambda: apc.critical(compiled(AVERAGE), "lan.delay", upper="1e6 s")) == [
-        "critical value: E846 from 0 to 1e+06 (SI) events coincide at more than 1,000 values of lan.delay, "
-        "the most that are searched. Write: a range up to 1 s"
+        "critical value: E846 from 0 s to 1e+06 s events coincide at more than 1,000 values of lan.delay, "
+        "the limit of the search. Use a range up to 1 s."
     ]
     late = compiled(replaced(AVERAGE, (DELAY, "delay: 2 s}")))
     for x in ("contact.stiffness=500 N/m:900 N/m", "lan.delay=0 s:2 s"):
         [message] = told(lambda x=x: apc.region(late, x=x, y="coordination.stiffness=0 N/m:1500 N/m"))
-        assert "hundreds of matrices, here of 506 states; 300 are the most" in message
+        assert "hundreds of matrices, here of 506 states; the limit is 300" in message
 
 
 @pytest.mark.whole
@@ -156,7 +160,7 @@ def test_what_takes_too_long_is_judged_and_not_varied(
     )
     assert run(["analyze"]) == 0
     printed = " ".join(capsys.readouterr().out.split())
-    assert "what moves it most: not looked for: 504 ticks in a frame take too long" in printed
+    assert "sensitivities not computed: 504 ticks in a frame take too long" in printed
 
 
 # ---- parts in parts ----
@@ -172,9 +176,9 @@ equations: [flange.f = -k*flange.x]
 @pytest.mark.parametrize(
     ("levels", "width", "message"),
     [
-        (9, 10, ":1:12: E216 L3 holds 1,111 parts, those inside parts included, and 1000 are the most"),
-        (24, 2, "those inside parts included, and 1000 are the most"),
-        (11, 1, ":1:12: E216 the parts of L10 stand inside one another more than 10 deep"),
+        (9, 10, ":1:12: E216 L3: expected at most 1000 parts, inner parts included, got 1,111"),
+        (24, 2, "expected at most 1000 parts, inner parts included"),
+        (11, 1, ":1:12: E216 the parts of L10 are nested more than 10 levels deep"),
         (500, 1, "E212 components contain or extend one another more than 50 deep"),
     ],
 )
@@ -195,9 +199,9 @@ def test_an_array_of_composites_or_inside_one_has_a_limit(tmp_path: Path) -> Non
     many = pair.replace("Pair", "Many").replace("Mass, mass", "Mass, count: 501, mass")
     own = library(tmp_path, pair, many)
     [line] = told(compiled, f"{AVERAGE}hands: {{n: {{type: Pair, count: 500}}}}\n", own)
-    assert "E216 a peer would have more than 1000 parts" in line
+    assert "E216 expected at most 1000 parts at a peer" in line
     lines = told(compiled, f"{AVERAGE}hands: {{n: {{type: Many}}}}\n", own)
-    assert "E208 the count of a wants a whole number from 1 to 500, got 501." in lines[0]
+    assert "E208 count of a: expected a whole number from 1 to 500, got 501." in lines[0]
 
 
 @pytest.mark.whole

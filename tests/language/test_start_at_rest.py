@@ -34,9 +34,11 @@ def _pressed(push: str = "0 N", held: str = "0 N", left: str = "device.x: -180 m
 def test_the_largest_force_that_nothing_balances_is_told_first_of_all() -> None:
     system = compiled(_pressed())
     first, second = apc.analyze(system).limitations
-    assert first.startswith("the start is not at rest: 120 N acts on left.")
-    assert "is not linear" in second
-    assert str(apc.analyze(system)).splitlines()[1].strip().startswith("the start is not at rest: 120 N")
+    assert first.startswith("the initial state is not at rest: 120 N acts on left.")
+    assert "nonlinear topology" in second
+    assert (
+        str(apc.analyze(system)).splitlines()[1].strip().startswith("the initial state is not at rest: 120 N")
+    )
     assert apc.analyze(system).to_dict()["limitations"] == [first, second]
 
 
@@ -50,7 +52,7 @@ def test_every_answer_that_holds_near_the_start_says_what_moves_there() -> None:
         apc.analyze_many(system, {"contact.stiffness": [500.0]}),
     )
     for one in found:
-        assert one.limitations[0].startswith("the start is not at rest: 120 N acts on left.")
+        assert one.limitations[0].startswith("the initial state is not at rest: 120 N acts on left.")
 
 
 @pytest.mark.parametrize("moved", ["-180 mm", "-17 cm"])
@@ -58,7 +60,7 @@ def test_of_forces_that_balance_nothing_is_said(moved: str) -> None:
     force = 600 * (0.02 - float(moved.split()[0]) * (0.001 if "mm" in moved else 0.01))
     balanced = f"device.x: {moved}, push.force: {-force} N, held.force: {force} N"
     [limitations] = apc.analyze(compiled(_pressed(left=balanced))).limitations
-    assert "is not linear" in limitations
+    assert "nonlinear topology" in limitations
 
 
 def test_of_a_topology_whose_verdict_does_not_depend_on_the_start_nothing_is_said() -> None:

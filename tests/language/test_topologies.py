@@ -121,8 +121,8 @@ def test_an_experiment_and_the_axes_of_a_study_are_kept() -> None:
         ("loss: 10 %", "lan.loss: [0 %, 60 %]", (0, Fraction(3, 5))),
         ("loss: {p: 1 %, r: 10 %}", "lan.loss.r: [2 %, 0.9]", (Fraction(1, 50), Fraction(9, 10))),
         ("jitter: 2 ms", "lan.jitter: [0 ms, 4 ms]", (0, 4 * MS)),
-        ("loss: 10 %", "lan.loss: [0 %, 120 %]", "E207 lan.loss wants 100 % or less, got 120 %."),
-        ("loss: 10 %", "lan.loss.r: [1 %, 90 %]", "the nearest is lan.loss. Write: lan.loss"),
+        ("loss: 10 %", "lan.loss: [0 %, 120 %]", "E207 lan.loss: expected 100 % or less, got 120 %."),
+        ("loss: 10 %", "lan.loss.r: [1 %, 90 %]", "the nearest is lan.loss. Try: lan.loss"),
     ],
 )
 def test_what_a_link_loses_by_can_be_an_axis_of_a_study(printed: str, axis: str, ends: Any) -> None:
@@ -165,7 +165,7 @@ def test_a_trace_is_a_column_of_delays_lost_ones_infinite_and_stays_in_the_model
             assert model.links[0].channel.trace.tolist() == expected
     for more in ("loss: 1 %", "jitter: 1 ms", "delays: {user: {user: 3 ms}}"):
         path.write_text(replaced(AVERAGE, ("8 ms}", f"8 ms, trace: delays.csv, {more}}}")), encoding="utf-8")
-        with pytest.raises(apc.ApcError, match="E262 lan has a trace, which says when every packet arrives"):
+        with pytest.raises(apc.ApcError, match="E262 lan has a trace, which can't be combined with"):
             apc.compile(path)
 
 
@@ -215,7 +215,7 @@ def test_a_part_of_another_type_at_a_group_has_the_numbers_of_that_type() -> Non
     for other in (system, compiled(over)):
         assert apc.analyze(other).spectral_radius == pytest.approx(plain.spectral_radius, rel=1e-12)
     with pytest.raises(
-        apc.ApcError, match=r"HapticDevice has no force_limit, .* Write: device.force_limit: 1 N"
+        apc.ApcError, match=r"HapticDevice has no force_limit, .* Try: device.force_limit: 1 N"
     ):
         compiled(replaced(text, ("type: Omega3", "type: HapticDevice")))
 
@@ -225,7 +225,7 @@ def test_a_number_of_another_type_at_a_group_has_the_unit_it_has_elsewhere(tmp_p
     device = device.replace("HapticDevice", "RateMass").replace("N*s/m, min", "1/s, min")
     folder = library(tmp_path, device.replace("- damping*v", "- mass*damping*v"))
     text = (TOPOLOGIES / "teleoperation-pair.yaml").read_text("utf-8").replace("Omega3", "RateMass")
-    with pytest.raises(apc.ApcError, match="wants damping in N\\*s/m, got damping in 1/s"):
+    with pytest.raises(apc.ApcError, match="expected damping in N\\*s/m, got damping in 1/s"):
         compiled(text, folder)
 
 
@@ -234,7 +234,7 @@ def test_what_nobody_reads_or_hears_is_left_out_and_said(tmp_path: Path) -> None
         ("  network: 8 ms", "  network: 8 ms\n  spare: 3 ms"),
         ("  lan: {", "  wan: {clock: network, loss: 2 %, jitter: 1 ms}\n  lan: {"),
     )
-    assert system.dropped == (("wan", "nobody hears what it would carry"), ("spare", "nothing ticks with it"))
+    assert system.dropped == (("wan", "its packets are not received"), ("spare", "it is not used"))
     assert [one.name for one in (*system.links, *system.clocks)] == ["lan", "haptic", "network"]
     assert not [name for name in exact(system) if name.startswith("wan")]
     own = (
@@ -251,7 +251,7 @@ def test_what_nobody_reads_or_hears_is_left_out_and_said(tmp_path: Path) -> None
     assert system.peer_types[0].sends[0].channels == ("all.x", "all.same")
     receives = system.peer_types[0].clocks[0].receives
     assert [(one.operator, one.channel) for one in receives] == [("mean", 0), ("sum", 1)]
-    assert ("all.v", "nobody hears it") in system.dropped
+    assert ("all.v", "it is not received") in system.dropped
 
 
 def test_a_held_value_is_sent_though_only_another_kind_of_peer_hears_it(tmp_path: Path) -> None:
@@ -293,29 +293,37 @@ links: {lan: {clock: tick, delay: 2 ms, graph: star}}
 
 # ---- what a topology seldom means ----
 
-RANGE = "is a range: analyze and tune are for every constant delay in it, and report delays that change "
-RANGE += "from packet to packet; other answers are for its middle; simulate and export want one delay."
+RANGE = "is a range: analyze and tune cover every constant delay in it and report delays that change "
+RANGE += "from packet to packet; other commands use the midpoint; simulate and export need a single delay."
 UNSHARED = (
-    "follows the other peers' by coordination and is not shared: its mass counts once a peer. "
-    "Write: shared: true, or shared: false where each is a mass of its own"
+    "is coupled to the other peers by coordination but is not shared; its mass applies to each peer in full. "
+    "Use shared: false if each peer has a separate mass. Try: shared: true, or shared: false"
 )
+ALL_LOST = "W277 every packet of lan is lost, so no packet ever arrives."
 ODD: list[tuple[tuple[tuple[str, str], ...], list[str]]] = [
     ((), []),
-    ((("links:\n", "links:\n  wan: {clock: network}\n"),), ["15:3: W271 nobody uses the link wan."]),
+    ((("links:\n", "links:\n  wan: {clock: network}\n"),), ["15:3: W271 the link wan is not used."]),
     ((("masses:\n", "masses:\n  lone: {mass: 1 kg}\n"),),
-     ["9:3: W272 lone is joined to nothing: no coupler, no hand and no other mass."]),
+     ["9:3: W272 lone is not connected to a coupler, a hand or another mass."]),
     ((("masses:\n", "masses:\n  lone: {mass: 1 kg, flange: device}\n"),), []),
     ((("b: cube, ", "b: ground, "),), []),
     ((("masses:\n", "masses:\n  fixed: {mass: 1 kg, flange: ground}\n"),), []),
     ((("  user: {count: 3}", "  left: {count: 2}\n  right: {count: 2}"),
       ("b: cube, ", "b: cube, at: [left], ")),
-     ["10:3: W272 device of right is joined to nothing: no coupler, no hand and no other mass."]),
+     ["10:3: W272 device of right is not connected to a coupler, a hand or another mass."]),
     ((("delay: 8 ms}", "delay: [8 ms, 20 ms]}"),), [f"15:3: W275 lan.delay {RANGE}"]),
+    ((("delay: 8 ms}", "delay: 8 ms, loss: 1}"),), [f"15:44: {ALL_LOST} Try: loss: 1 %"]),
+    ((("delay: 8 ms}", "delay: 8 ms, loss: 100 %}"),), [f"15:44: {ALL_LOST}"]),
+    ((("delay: 8 ms}", "delay: 8 ms, loss: 99 %}"),), []),
+    # A bad link that loses everything and never turns good; one that turns good; good links lose all, too.
+    ((("delay: 8 ms}", "delay: 8 ms, loss: {p: 1 %, r: 0 %}}"),), [f"15:44: {ALL_LOST}"]),
+    ((("delay: 8 ms}", "delay: 8 ms, loss: {p: 1, r: 1 %}}"),), []),
+    ((("delay: 8 ms}", "delay: 8 ms, loss: {p: 0, r: 1, 1-k: 100 %}}"),), [f"15:44: {ALL_LOST}"]),
     ((("object: cube", "object: device"),), [f"9:3: W274 device {UNSHARED}"]),
     ((("object: cube", "object: device"), ("damping: 5 N*s/m}", "damping: 5 N*s/m, shared: false}")), []),
     ((("object: cube", "object: device"), ("a: device, b: cube", "a: ground, b: cube"),
       ("count: 3", "count: 3, set: {device.mass: 1 kg}")),
-     ["10:3: W273 cube is shared, and nothing couples its copies."]),
+     ["10:3: W273 cube is shared, but no element couples its copies."]),
     (((", shared: true", ""),), [f"10:3: W274 cube {UNSHARED}"]),
 ]  # fmt: skip
 
@@ -376,8 +384,8 @@ def test_what_a_link_does_is_listed_in_words(tmp_path: Path, capsys: pytest.Capt
     channel = "8 ms, loss: {p: 1 %, r: 25 %}, jitter: 2 ms, distribution: pareto, reorder: all}"
     (tmp_path / "topology.yaml").write_text(replaced(AVERAGE, ("8 ms}", channel)), encoding="utf-8")
     assert run(["compile", str(tmp_path / "topology.yaml"), "--until", "topology"]) == 0
-    lines = ["  loss: p 1 %, r 25 %, 1-h 100 %, 1-k 0 %", "  jitter 2 ms, pareto"]
-    lines += ["  the packet that arrived last counts; a lost one changes nothing"]
+    lines = ["  Gilbert–Elliott loss: p 1 %, r 25 %, 1-h 100 %, 1-k 0 %", "  jitter 2 ms, pareto"]
+    lines += ["  uses the packet that arrived last, holds the previous value on loss"]
     assert set(lines) <= set(capsys.readouterr().out.splitlines())
 
 

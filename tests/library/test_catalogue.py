@@ -81,11 +81,10 @@ def test_a_misspelt_component_or_topology_is_told_with_the_nearest(call: Call) -
     assert call("library", "AveragePositon") == (
         1,
         "",
-        "apc library: E206 the library has no AveragePositon. Write: apc library AveragePosition\n",
+        "apc library: E206 unknown component 'AveragePositon'. Try: apc library AveragePosition\n",
     )
     assert call("new", "--like", "three-user-average")[2] == (
-        "--like: E206 the library has no topology three-user-average. "
-        "Write: apc new --like three-users-average\n"
+        "--like: E206 unknown topology three-user-average. Try: apc new --like three-users-average\n"
     )
 
 
@@ -113,7 +112,7 @@ def test_a_copy_takes_another_name_and_brings_the_tables_it_names(call: Call) ->
     assert call("new", "other", "--like", "users-table")[0] == 0  # the table is there as it is
     Path("users.csv").write_text("device.mass [kg]\n1\n", encoding="utf-8")
     assert call("new", "third", "--like", "users-table")[2] == (
-        "users.csv: E613 exists already and is left as it is. Write: mv users.csv another-name.csv\n"
+        "users.csv: E613 file exists and was not changed. Try: mv users.csv another-name.csv\n"
     )
     assert not Path("third.yaml").exists()
 
@@ -137,7 +136,7 @@ def test_a_group_has_rows_of_its_own_and_a_fixed_count_says_why(call: Call) -> N
     call("new", "--like", "users-table")
     out = call("show", "users-table.yaml", "--parameters")[1]
     assert "user.device.mass" in out and "0.08 to 0.25 kg" in out
-    assert "not to be set: device.mass has a value for each peer" in " ".join(out.split())
+    assert "fixed: device.mass has a value for each peer" in " ".join(out.split())
     rows = apc.parameters("users-table.yaml").to_dict()["rows"]
     [mass] = [one for one in rows if one["name"] == "user.device.mass"]
     assert (mass["low"], mass["high"], mass["unit"], mass["minimum"]) == (0.08, 0.25, "kg", 0.0)

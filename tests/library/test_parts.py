@@ -228,7 +228,7 @@ def test_stylus_arms_have_the_published_values_and_keep_to_their_limits(name: st
         for limit, beyond in ((low, 0.999 * low), (high, 1.001 * high)):
             assert values(held(f"{part}, {word}: {limit} {unit}"))[f"it.{word}"] == limit
             (line,) = told(held, f"{part}, {word}: {beyond} {unit}")
-            assert f" E207 {word} wants {limit:g} {unit} or " in line
+            assert f" E207 {word}: expected {limit:g} {unit} or " in line
     (_, m, _), (_, b, _), (_, k, _) = STYLUS_ARMS[name]
     assert in_a_second(system) == pytest.approx(swings(2 + m, 3 + b, k), rel=1e-12)
 
@@ -275,4 +275,4 @@ def test_a_table_is_handed_on_to_a_part_inside(tmp_path: Path) -> None:
     assert pushes(apc.compile(path), {}) == pytest.approx([2.0], rel=1e-14)
     library(tmp_path, tabled.replace("UNIT", "mm"))
     [line] = told(apc.compile, path)
-    assert "E204 force wants N, got mm." in line
+    assert "E204 force: expected N, got mm." in line

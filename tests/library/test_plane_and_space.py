@@ -93,7 +93,7 @@ def test_disc_contact_and_sphere_contact_push_along_the_line_of_centres_and_neve
 
 def test_coinciding_centres_have_no_direction_and_no_verdict() -> None:
     """norm has no slope at zero, as sqrt has none: the start is refused, not guessed."""
-    with pytest.raises(apc.ApcError, match=r"E808 .*at the start values"):
+    with pytest.raises(apc.ApcError, match=r"E808 .*at the initial state"):
         apc.analyze(compiled(radial(2)))
 
 

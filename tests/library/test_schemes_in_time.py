@@ -151,7 +151,7 @@ def test_set_position_modulation_gives_no_energy(delay: int, energy: float) -> N
     run = run_of(text, "3 s", "*")
     x, v = np.array(of_all(run, "cube.x")), np.array(of_all(run, "cube.v"))
     goal, stored, spare, received = (
-        np.array(of_all(run, f"it.{one}")) for one in ("goal", "energy", "spare", "heard")
+        np.array(of_all(run, f"it.{one}")) for one in ("goal", "energy", "surplus", "received")
     )
     # What is told at a row is that of the tick before: as it stands there, after that tick.
     x, v = x[:, :-1], v[:, :-1]
@@ -218,7 +218,7 @@ def test_dead_reckoning_is_its_law(delay: int, threshold: float) -> None:
 
 # ---- god-object ----
 
-ROUGH, LOCATION = topology("god-object"), "table.stuck"
+ROUGH, LOCATION = topology("god-object"), "table.god_object"
 
 
 @pytest.mark.parametrize("sideways", [0.0, 0.8, -0.99, 1.3, -2.0])

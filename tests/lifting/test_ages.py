@@ -216,9 +216,9 @@ def test_ages_that_differ_from_sender_to_sender_are_played_and_not_analysed(tmp_
     with pytest.raises(ApcError) as refused:
         apc.analyze(system)
     assert str(refused.value).splitlines()[0] == (
-        "topology.yaml: E811 the age of what peers of left and right hear over lan differs from sender to "
-        "sender (lan.delay, lan.delays.left.right): that is not analysed; a simulation plays it. "
-        "Write: apc simulate"
+        "topology.yaml: E811 the age of samples received by left and right over lan differs "
+        "between senders (lan.delay, lan.delays.left.right); different ages can be simulated but not "
+        "analyzed. Try: apc simulate"
     )
     assert np.isfinite(positions(system)).all()
 
@@ -237,6 +237,7 @@ def test_a_file_whose_ages_differ_compiles_and_is_simulated(
     assert "E811" in capsys.readouterr().err
 
 
+@pytest.mark.needs_extension("event_order")
 def test_another_order_of_events_has_its_own_ages(tmp_path: Path) -> None:
     """A tick that misses the packet that arrives with it hears one a period older, as if it were later."""
     found = apc.event_order(topology(next(iter(LAWS)), "4 ms", tmp_path))

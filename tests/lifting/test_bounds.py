@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from apc.frame.interval_arithmetic import FLOATS, MIDPOINT_RADIUS, error_radius, value_of, with_error_radius
+from apc.lifting.interval_arithmetic import FLOATS, MIDPOINT_RADIUS, error_radius, value_of, with_error_radius
+from apc.spectrum.eigenpairs import largest_magnitudes
 
 
 def _fractions(matrix: Any) -> Any:
@@ -52,3 +53,12 @@ def test_the_true_one_of_all_that_lie_within_the_radii_lies_within(name: str, se
             for one, off, sign in zip((a, b), (error_bound_a, error_bound_b), corner, strict=True)
         ]
         assert _within(found, exactly(*moved))
+
+
+def test_the_largest_magnitude_is_that_of_the_chosen_roots() -> None:
+    # Companion matrices of chosen roots: 3 and −4; 0.3 ± 0.4i; a nilpotent one.
+    polynomials = np.array([np.poly([3.0, -4.0]), np.poly([0.3 + 0.4j, 0.3 - 0.4j]).real, [1.0, 0.0, 0.0]])
+    matrices = np.array([[[-b, -c], [1.0, 0.0]] for _, b, c in polynomials])
+    assert largest_magnitudes(matrices) == pytest.approx([4.0, 0.5, 0.0], abs=1e-14)
+    assert largest_magnitudes(matrices[0]) == pytest.approx(4.0, abs=1e-14)
+    assert largest_magnitudes(np.zeros((2, 0, 0))).tolist() == [0.0, 0.0]

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from apc.compiler.errors import ApcError
-from apc.frame.discretize import discretize
+from apc.lifting.discretize import discretize
 
 DAMPINGS = (0.0, 1e-12, 1e-6, 5.0, 1e6)
 

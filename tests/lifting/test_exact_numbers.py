@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from apc.compiler import expression_data
-from apc.frame.exact_arithmetic import ROWS, evaluate_exact
+from apc.parameter_values.exact_arithmetic import ROWS, evaluate_exact
 
 PAIRS = {
     *("add", "sub", "mul", "div", "pow", "constpow", "fmin", "fmax", "atan2"),

@@ -11,7 +11,7 @@ import pytest
 from apc.benchmark.truth import spectral_truth as of_balls
 from apc.compiler.compiled import Model
 from apc.compiler.pipeline import compile_topology
-from apc.eigen.ball_arithmetic import precision
+from apc.spectrum.ball_arithmetic import precision
 from tests.bench.random_topologies import run
 from tests.bruteforce import TopologySource, as_ball, frame_matrix
 from tests.fifty_digits.truth import Truth, spectral_truth

@@ -16,7 +16,8 @@ from hypothesis import strategies as st
 
 from apc.analysis.analysis import analyze, lifted_groups
 from apc.compiler.errors import ApcError
-from apc.eigen.modes import dense, split
+from apc.lifting.numeric_model import numeric_model
+from apc.spectrum.modes import dense, split
 from tests.bruteforce import TopologySource, common_period, frame_matrix
 from tests.sites import MS, alone, paper
 from tests.topologies import compiled
@@ -75,7 +76,7 @@ def at(comp: float, comm: float, phase: float = 0, first: float = 0, own: bool =
 
 def check(topology: TopologySource) -> None:
     """Compare the split and the dense spectrum of a topology's text with that of peers stepped one by one."""
-    groups, exchange = lifted_groups(compiled(text_of(topology)))
+    groups, exchange = lifted_groups(numeric_model(compiled(text_of(topology))))
     systems = split(groups, exchange)
     modes = np.concatenate([np.repeat(np.linalg.eigvals(one.matrix), one.multiplicity) for one in systems])
     whole = np.linalg.eigvals(dense(groups, exchange).matrix)
@@ -159,11 +160,15 @@ def test_what_is_remembered_and_held_is_a_state_where_it_is_read(
     ticks: list[str], delay: str, names: list[str], expected: list[list[float]]
 ) -> None:
     variables = ", f: {unit: 1, start: 0}" + (", s: {unit: 1, start: 0}" if len(ticks) > 1 else "")
-    [group], _ = lifted_groups(alone("hold(f, delay) - x", *ticks, variables=variables, delay=delay))
+    [group], _ = lifted_groups(
+        numeric_model(alone("hold(f, delay) - x", *ticks, variables=variables, delay=delay))
+    )
     assert list(group.z_names) == names
     np.testing.assert_allclose(group.lifted.p[0], expected, rtol=1e-14)
 
 
 def test_clocks_that_hardly_ever_stand_as_before_are_refused_with_their_periods() -> None:
-    with pytest.raises(ApcError, match=r"E805 the clocks' common period is .*haptic 1.00003 ms"):
-        analyze(paper(haptic=Fraction(100003, 10**8)))
+    with pytest.raises(
+        ApcError, match=r"E805 the frame .common period of the clocks. is .*haptic 1.00003 ms"
+    ):
+        analyze(numeric_model(paper(haptic=Fraction(100003, 10**8))))

@@ -11,8 +11,9 @@ import pytest
 
 import apc
 from apc.analysis.analysis import analyze, lifted_groups
-from apc.eigen.modes import split
-from apc.eigen.spectrum import angles_in_frame
+from apc.lifting.numeric_model import numeric_model
+from apc.spectrum.modes import split
+from apc.spectrum.spectrum import angles_in_frame
 from tests.language import own
 from tests.sites import paper
 from tests.topologies import OSCILLATOR, TOPOLOGIES, compiled, library
@@ -35,7 +36,7 @@ CLOCKED = OSCILLATOR.replace("peers:", "clocks: {{haptic: {frame}}}\npeers:") + 
 )
 def test_an_oscillator_without_clocks_has_its_own_frequency(hertz: float, ratio: float) -> None:
     """The frame is one second, so that all of them fold but the first."""
-    found = analyze(compiled(OSCILLATOR.format(**numbers(hertz, ratio))))
+    found = analyze(numeric_model(compiled(OSCILLATOR.format(**numbers(hertz, ratio)))))
     expected = hertz * math.sqrt(1 - ratio**2)
     for mode in found.modes:
         assert mode.frequency_hz == pytest.approx(expected, rel=1e-9)
@@ -46,7 +47,7 @@ def test_an_oscillator_without_clocks_has_its_own_frequency(hertz: float, ratio:
 @pytest.mark.parametrize("frame", ["1 ms", "7/3 ms", "20 ms", "100 ms", "1 s"])
 @pytest.mark.parametrize(("hertz", "ratio"), [(3.3, 0.2), (40, 0.02), (700, 0.001)])
 def test_the_frame_does_not_matter(frame: str, hertz: float, ratio: float) -> None:
-    found = analyze(compiled(CLOCKED.format(frame=frame, **numbers(hertz, ratio))))
+    found = analyze(numeric_model(compiled(CLOCKED.format(frame=frame, **numbers(hertz, ratio)))))
     mode = found.modes[0]
     assert mode.frequency_hz == pytest.approx(hertz * math.sqrt(1 - ratio**2), rel=1e-6)
     assert mode.damping_ratio == pytest.approx(ratio, rel=1e-4)
@@ -57,7 +58,7 @@ def test_what_folds_onto_the_real_axis_is_told_by_its_changes_of_sign(halves: in
     """So many half turns in a frame: e^{sT} is real, twice, up to the rounding of the numbers."""
     damped = math.pi * halves
     text = OSCILLATOR.format(stiffness=repr(damped**2 + 0.25), damping="1.0")
-    for mode in analyze(compiled(text)).modes:
+    for mode in analyze(numeric_model(compiled(text))).modes:
         assert mode.frequency_hz == pytest.approx(halves / 2, rel=1e-6)
         assert mode.damping_ratio == pytest.approx(0.5 / math.hypot(damped, 0.5), rel=1e-6)
 
@@ -67,7 +68,11 @@ def test_what_is_computed_from_itself_alone_turns_from_tick_to_tick(tmp_path: Pa
     law = own.component("s = -0.9*previous(s)", "flange.f = hold(s + 0*K*sample(flange.x))", variables="s=N:")
     slow = "  slow: {type: SampledSpringDamper, a: device, b: ground, stiffness: 1 N/m, clock: late}\n"
     text = own.topology(law).replace("clocks: {", f"couplers:\n{slow}clocks: {{late: 10 ms, ")
-    flips = next(one for one in analyze(compiled(text, library(tmp_path, law))).modes if one.magnitude < 0.5)
+    flips = next(
+        one
+        for one in analyze(numeric_model(compiled(text, library(tmp_path, law)))).modes
+        if one.magnitude < 0.5
+    )
     assert flips.magnitude == pytest.approx(0.9**10, rel=1e-9)
     assert flips.frequency_hz == pytest.approx(500, rel=1e-9)
 
@@ -75,7 +80,7 @@ def test_what_is_computed_from_itself_alone_turns_from_tick_to_tick(tmp_path: Pa
 @pytest.mark.parametrize(("name", "count"), [("three-users-mesh", 3), ("planar-users", 2)])
 def test_a_certified_real_negative_eigenvalue_keeps_its_frequency_and_damping(name: str, count: int) -> None:
     """λ = −|λ| is e^{sT} with Im s T = π: half a turn in a frame of 8 ms, 62.5 Hz. In a plane λ is double."""
-    modes = analyze(apc.compile(TOPOLOGIES / f"{name}.yaml"), certify=True).modes
+    modes = analyze(numeric_model(apc.compile(TOPOLOGIES / f"{name}.yaml")), certify=True).modes
     negative = [mode for mode in modes if abs(mode.eigenvalue.imag) < 1e-99 and mode.eigenvalue.real < -1e-6]
     assert len(negative) == count
     for mode in negative:
@@ -85,7 +90,7 @@ def test_a_certified_real_negative_eigenvalue_keeps_its_frequency_and_damping(na
 
 
 def test_what_a_mode_turns_hangs_on_no_phase_of_its_vector() -> None:
-    for system in split(*lifted_groups(apc.compile(TOPOLOGIES / "two-users-reported.yaml"))):
+    for system in split(*lifted_groups(numeric_model(apc.compile(TOPOLOGIES / "two-users-reported.yaml")))):
         values, vectors = np.linalg.eig(system.matrix.astype(complex))
         values.imag[np.abs(values.imag) < 1e-12] = 0.0
         shares = np.abs(vectors * np.linalg.pinv(vectors).T)
@@ -96,7 +101,7 @@ def test_what_a_mode_turns_hangs_on_no_phase_of_its_vector() -> None:
 
 def test_what_is_gone_within_a_frame_has_no_frequency_rather_than_a_wrong_one() -> None:
     """e^(−31) of it is left after a frame: 3e-14, which rounding hides."""
-    found = analyze(compiled(OSCILLATOR.format(**numbers(10.0, 0.5))))
+    found = analyze(numeric_model(compiled(OSCILLATOR.format(**numbers(10.0, 0.5)))))
     assert all(math.isnan(mode.frequency_hz) and math.isnan(mode.damping_ratio) for mode in found.modes)
     assert [mode["frequency_hz"] for mode in found.to_dict()["modes"]] == [None, None]
 
@@ -123,7 +128,7 @@ links:
 hands:
   arm: {type: SpringDamperArm, flange: device, stiffness: 80 N/m, damping: 1 N*s/m}
 """
-    common, one, other = analyze(compiled(text)).modes[:3]
+    common, one, other = analyze(numeric_model(compiled(text))).modes[:3]
     assert common.frequency_hz == pytest.approx(1000)
     assert one.eigenvalue == other.eigenvalue.conjugate()
     assert one.magnitude == pytest.approx(common.magnitude, rel=1e-6)
@@ -131,10 +136,10 @@ hands:
 
 
 def test_shares_name_the_states_that_take_part_and_add_up() -> None:
-    found = analyze(paper(kt=800.0, bt=2.0, kc=1500.0, bc=2.0))
+    found = analyze(numeric_model(paper(kt=800.0, bt=2.0, kc=1500.0, bc=2.0)))
     for mode in found.modes:
         assert sum(share for _, share in mode.participation) == pytest.approx(1, abs=1e-12)
         assert [name for name, _ in mode.participation][:2] == ["device.x", "device.v"]
-    free = analyze(paper(kc=0.0, kt=0.0, comp=Fraction(0)))
+    free = analyze(numeric_model(paper(kc=0.0, kt=0.0, comp=Fraction(0))))
     slow = next(mode for mode in free.modes if abs(mode.eigenvalue - math.exp(-0.2)) < 1e-9)  # b/m_O = 25/s
     assert dict(slow.participation)["cube.v"] == pytest.approx(1, abs=1e-9)

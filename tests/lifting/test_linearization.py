@@ -8,7 +8,8 @@ import pytest
 from apc.analysis.analysis import analyze, lifted_groups
 from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError
-from apc.eigen.modes import dense, split
+from apc.lifting.numeric_model import numeric_model
+from apc.spectrum.modes import dense, split
 from tests.bruteforce import TopologySource, frame_matrix
 from tests.pairing import apart, arcs_of
 from tests.sites import edged, paper
@@ -37,27 +38,34 @@ def test_an_edge_function_is_linearized_pair_by_pair(operator: str, graph: str, 
     topology = TopologySource(operator, 4, weights=arcs, pairs=_cubic_pairs(starts, 2e5), **GAINS)
     expected = np.linalg.eigvals(np.array(frame_matrix(topology)))
     assert apart(_split(system), expected) < 1e-11
-    whole = np.linalg.eigvals(dense(*lifted_groups(system)).matrix)
+    whole = np.linalg.eigvals(dense(*lifted_groups(numeric_model(system))).matrix)
     assert apart(whole, expected) < 1e-11
 
 
 def _split(system: Model) -> np.ndarray:
     """Return all eigenvalues of the split system, each as often as it counts."""
-    systems = split(*lifted_groups(system))
+    systems = split(*lifted_groups(numeric_model(system)))
     return np.concatenate([np.repeat(np.linalg.eigvals(one.matrix), one.multiplicity) for one in systems])
 
 
 def test_the_largest_of_equal_peers_has_no_linearization() -> None:
-    with pytest.raises(ApcError, match=r"E803 .* of user\[1\]: max over equal peers has no linearization"):
-        analyze(edged("max", [0.0] * 3))
-    assert analyze(edged("max", [0.0, 0.01, 0.02])).linearized
+    with pytest.raises(
+        ApcError, match=r"E803 .* of user\[1\]: max over peers with equal values has no linearization"
+    ):
+        analyze(numeric_model(edged("max", [0.0] * 3)))
+    assert analyze(numeric_model(edged("max", [0.0, 0.01, 0.02]))).linearized
     # Two peers: the only other one is the largest, and the smallest, and the mean.
-    two = [analyze(edged(operator, [0.0] * 2)).spectral_radius for operator in ("max", "min", "mean")]
+    two = [
+        analyze(numeric_model(edged(operator, [0.0] * 2))).spectral_radius
+        for operator in ("max", "min", "mean")
+    ]
     assert two == pytest.approx([two[0]] * 3, abs=1e-12)
 
 
 def test_the_largest_is_the_one_that_starts_furthest_away() -> None:
     """F_T = K max_j (x_i − x_j): everyone hears the lowest, the lowest the next: a graph of arcs."""
     arcs = {(1, 0): 1.0, (2, 1): 1.0, (1, 2): 1.0}
-    expected = analyze(paper(weights=arcs), method="dense").spectral_radius
-    assert analyze(edged("max", [0.03, 0.0, 0.01])).spectral_radius == pytest.approx(expected, abs=1e-10)
+    expected = analyze(numeric_model(paper(weights=arcs)), method="dense").spectral_radius
+    assert analyze(numeric_model(edged("max", [0.03, 0.0, 0.01]))).spectral_radius == pytest.approx(
+        expected, abs=1e-10
+    )

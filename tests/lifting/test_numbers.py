@@ -14,11 +14,12 @@ from apc.__main__ import run
 from apc.compiler.compiled import Model, counts_peers
 from apc.compiler.errors import ApcError
 from apc.compiler.pipeline import compile_topology
-from apc.frame.overrides import Override, apply, parse_override
-from apc.frame.parameter_names import ParameterRef, find, is_named
-from apc.frame.parameters import resolve
-from apc.parameter_studies.batch_analysis import analyze_many
-from apc.parameter_studies.margins import margins
+from apc.lifting.numeric_model import numeric_model
+from apc.parameter_values.overrides import Override, apply, parse_override
+from apc.parameter_values.parameter_names import ParameterRef, find, is_named
+from apc.parameter_values.parameters import resolve
+from apc.studies.batch_analysis import analyze_many
+from apc.studies.margins import margins
 from tests.topologies import AVERAGE, MESH, TOPOLOGIES, compiled, library, replaced
 
 
@@ -160,7 +161,7 @@ def test_what_depends_on_a_column_is_worked_out_peer_by_peer(tmp_path: Path) -> 
 def test_what_is_set_for_all_groups_says_what_each_of_them_has(capsys: pytest.CaptureFixture[str]) -> None:
     """The star's teacher holds on with 400 N/m of its own, its students with the part's 100 N/m."""
     told = (
-        "arm.stiffness is one value for all groups here; the topology has 400 N/m at teacher, 100 N/m "
+        "arm.stiffness has one value for all groups here; the topology has 400 N/m at teacher, 100 N/m "
         "at student"
     )
     star = compile_topology(TOPOLOGIES / "star-lecture.yaml")
@@ -181,8 +182,8 @@ def test_what_the_compiler_counts_or_adds_is_nobody_s_to_set() -> None:
         for name in unnamed:
             with pytest.raises(ApcError, match="E623" if counts_peers(name) else "E622"):
                 find(system, name)
-        assert all(is_named(row.parameter) for row in margins(system).rows)
-    with pytest.raises(ApcError, match=r"E623 user.count is a number of peers, which doesn't vary here"):
+        assert all(is_named(row.parameter) for row in margins(numeric_model(system)).rows)
+    with pytest.raises(ApcError, match=r"E623 user.count is a number of peers and can't be varied here"):
         find(own, "user.count")
     five = apply(own, [parse_override(own, "user.count=5")])
     assert five.groups[0].count == 5

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from apc.analysis.paper_method import analyze_paper, paper_method
+from apc.extensions.paper_method.lifted_matrices import analyze_paper, paper_method
 from tests.sites import paper
 from tests.topologies import AVERAGE, MESH, compiled, replaced, told
 
@@ -61,7 +61,7 @@ def test_at_the_boundary_it_says_that_its_matrix_is_not_proved() -> None:
     assert found.stable is None
     assert found.verdict.startswith("undecided")
     assert tuple(map(str, found.notes[1:])) == (
-        "paper: not proved, as its matrix was not composed from sites",
+        "paper: not proved, as its matrix was not composed from those of peers",
     )
 
 

@@ -76,7 +76,7 @@ def _text(changes: dict[str, str]) -> str:
 def test_a_coefficient_that_changes_with_time_is_refused_by_name(place: str, tmp_path: Path) -> None:
     system = compiled(TOPOLOGY, library(tmp_path, _text(VARYING[place])))
     for requested in (analyze, lambda topology: critical(topology, "w.k")):
-        with pytest.raises(ApcError, match=r"topology\.yaml: E810 the equation of .* changes with time"):
+        with pytest.raises(ApcError, match=r"topology\.yaml: E810 the equation of .* function of time"):
             requested(system)
 
 
@@ -98,9 +98,9 @@ def test_a_contact_that_a_push_decides_about_is_linearized_and_says_so(tmp_path:
     found = analyze(compiled(TOPOLOGY, library(tmp_path, _text(changes))))
     assert found.linearized
     first, second, _, third, *_ = str(found).splitlines()
-    assert first == f"timed: {found.verdict}, linearized at its start"
-    assert second == "  the start is not at rest: 0.1 N acts on device; what happens is played: apc"
-    assert third.startswith("  left out: the topology is not linear, and this holds near its start values")
+    assert first == f"timed: {found.verdict}, linearized at the initial state"
+    assert second == "  the initial state is not at rest: 0.1 N acts on device; for the motion over"
+    assert third.startswith("  nonlinear topology: the result holds near the initial state")
 
 
 def test_a_proof_of_a_linearization_says_of_what(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ import pytest
 from apc.analysis.analysis import analyze
 from apc.analysis.model_size import model_size
 from apc.compiler.pipeline import compile_topology
+from apc.lifting.numeric_model import numeric_model
 from tests.topologies import AVERAGE, TOPOLOGIES, compiled, replaced
 
 # Of every topology: motion, delayed forces and packets of a peer of each kind. Counted by hand: two masses or
@@ -75,4 +76,4 @@ def test_a_peer_keeps_its_motion_its_delayed_forces_and_its_packets_on_their_way
     system = compiled(replaced(AVERAGE, *changes))
     (subsystem,) = model_size(system).subsystems
     assert (subsystem.motion, subsystem.stored, subsystem.packets) == counts
-    assert subsystem.states == sum(counts) == analyze(system).states_per_peer
+    assert subsystem.states == sum(counts) == analyze(numeric_model(system)).states_per_peer

@@ -12,9 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from apc.eigen.ball_arithmetic import precision
-from apc.eigen.certification import root_discs
-from apc.eigen.enclosure import enclose_eigenvalues, enclose_stack, least_radius
+from apc.spectrum.ball_arithmetic import precision
+from apc.spectrum.certification import root_discs
+from apc.spectrum.enclosure import enclose_eigenvalues, enclose_stack, least_radius
 
 Floats = NDArray[Any]
 

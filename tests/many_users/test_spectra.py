@@ -12,6 +12,15 @@ from numpy.typing import NDArray
 import apc
 from apc.analysis.analysis import Analysis
 from apc.compiler.errors import ApcError
+from apc.spectrum.eigenpairs import (
+    components,
+    driving_parts,
+    eigenpairs,
+    eigenvalues,
+    inverses,
+    largest_magnitudes,
+    pairs_of_eigenvalues,
+)
 from tests.bruteforce import TopologySource, frame_matrices, frame_matrix
 from tests.pairing import apart, arcs_of
 from tests.topologies import AVERAGE, compiled, replaced
@@ -232,16 +241,53 @@ def test_the_method_is_chosen_by_what_differs(text: str, method: str) -> None:
         (
             text_of(TopologySource(peers=200)),
             "dense",
-            "E804 200 peers make one system of 1,600 states; the matrix of one",
+            "E804 200 peers form one system of 1,600 states; the limit",
         ),
         (
             different(3, "ring"),
             "modes",
-            "E850 method modes can't serve this topology: all peers as one system",
+            "E850 method modes does not apply to this topology: all peers as one system",
         ),
-        (different(60, "ring"), "determinant", "E850 method determinant .* hear all others over lan"),
+        (
+            different(60, "ring"),
+            "determinant",
+            "E850 method determinant .* not completely connected over lan",
+        ),
     ],
 )
 def test_a_method_that_cannot_serve_is_refused(text: str, method: str, message: str) -> None:
     with pytest.raises(ApcError, match=message):
         apc.analyze(compiled(text), method=method)  # type: ignore[arg-type] # a method
+
+
+def test_eigenvalues_get_the_vectors_of_the_nearest_ones_each_once() -> None:
+    """A triangular matrix with eigenvalues that are equal or nearly so, in another order and rounded."""
+    matrix = np.diag([0.0, 0.5, 0.0, 0.9, 0.0, 0.5 + 1e-9]) + np.diag([0, 0, 0.3, 0, 0.2], 1)
+    values = np.array([0.9 + 1e-15, 0.0, 0.5 + 1.1e-9, 1e-17, -1e-17, 0.5 - 1e-10], dtype=np.complex128)
+    pairs = pairs_of_eigenvalues(matrix, values)
+    assert np.abs(matrix @ pairs.right - pairs.right * values).max() < 1e-9
+    assert np.abs(pairs.left @ matrix - values[:, None] * pairs.left).max() < 1e-9
+    assert len(np.unique(pairs.right.round(12), axis=1).T) == 6
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 9, 70])
+def test_components_are_states_that_reach_one_another(count: int) -> None:
+    random = np.random.default_rng(count)
+    for share in (0.0, 0.5 / max(count, 1), 1.5 / max(count, 1), 1.0):
+        driven = random.random((count, count)) < share
+        paths = np.eye(count) + driven
+        for _ in range(7):  # paths of up to 2^7 steps
+            paths = np.minimum(paths @ paths, 1.0)
+        mutual = (paths > 0) & (paths.T > 0)
+        expected = {tuple(np.flatnonzero(row).tolist()) for row in mutual}
+        assert [tuple(part.tolist()) for part in components(driven)] == sorted(expected)
+
+
+def test_a_matrix_of_no_states_has_no_eigenvalues() -> None:
+    """A mass that coasts alone leaves a block of no states once its translation is split off."""
+    empty, batch = np.zeros((0, 0)), np.zeros((2, 0, 0))
+    assert eigenpairs(empty).values.size == pairs_of_eigenvalues(empty, np.zeros(0, complex)).values.size == 0
+    assert eigenvalues(batch, batch)[0].shape == (2, 0)
+    assert largest_magnitudes(batch).tolist() == [0, 0]
+    assert inverses(empty).size == 0
+    assert components(empty.astype(bool)) == driving_parts(empty.astype(bool)) == []

@@ -1,6 +1,6 @@
 """Draw mutants of the product and say which of them the tests catch.
 
-    python -m tests.mutants --count 300 --seed 1 [--whole] [--within runtime/frame]
+    python -m tests.mutants --count 300 --seed 1 [--whole] [--within runtime/lifting]
 
 Each mutant is tried in a copy of this checkout, with the tests of every file of which a test ran the changed
 line, those that ran it first, the quickest before the others, for at most `--seconds` of what they took
@@ -73,7 +73,7 @@ def _copy(folder: Path) -> Path:
     keep = shutil.ignore_patterns("__pycache__", "*.apc")
     for name in ("compiler", "runtime", "models", "tests"):
         shutil.copytree(ROOT / name, folder / name, ignore=keep)
-    for name in ("pyproject.toml", "setup.py", "README.md", "CHANGELOG.md"):
+    for name in ("pyproject.toml", "setup.py", "README.md", "CHANGELOG.md", "LICENSE"):
         shutil.copy(ROOT / name, folder / name)
     package = folder / "lib" / "apc"
     package.mkdir(parents=True)

@@ -7,16 +7,16 @@ import re
 
 import pytest
 
-from apc.frame.numeric_model import prepare
-from apc.mean_square.lyapunov_exponent import TopLyapunovExponent, top_lyapunov_exponent
-from apc.not_supported import NotSupportedError
+from apc.extensions.loss_models.lyapunov_exponent import TopLyapunovExponent, top_lyapunov_exponent
+from apc.lifting.numeric_model import numeric_model
+from apc.support.not_supported import NotSupportedError
 from tests.held_topologies import system_of, topology
 from tests.networks.test_loss import decided
 
 
 def estimate(text: str) -> TopLyapunovExponent:
     system = system_of(text)
-    return top_lyapunov_exponent(system, prepare(system))
+    return top_lyapunov_exponent(numeric_model(system))
 
 
 # Of an independent program, for the paper's users at 10 % loss: peers, stiffness, exponent per frame and half
@@ -53,12 +53,15 @@ def test_what_grows_in_mean_square_is_told_almost_surely_too() -> None:
     ("text", "why"),
     [
         (topology(3, 500.0, more=", jitter: 2 ms"), "lan has jitter"),
-        (topology(3, 500.0, more=", on_loss: zero"), "lan takes no difference where a packet is missed"),
+        (
+            topology(3, 500.0, more=", on_loss: zero"),
+            "lan does not set the difference to 0 for a lost packet",
+        ),
         (topology(1000, 500.0), "1,000 peers and their channels have 1,005,000 states"),
-        (topology(20, 500.0), "20 peers and their channels have 500 states, and 180 are the most"),
+        (topology(20, 500.0), "20 peers and their channels have 500 states; the limit is 180"),
     ],
 )
 def test_what_is_not_estimated_is_named(text: str, why: str) -> None:
     system = system_of(text)
     with pytest.raises(NotSupportedError, match=f"^{re.escape(why)}"):
-        top_lyapunov_exponent(system, prepare(system))
+        top_lyapunov_exponent(numeric_model(system))

@@ -34,6 +34,7 @@ def burst(share: float, packets: int) -> str:
     return f"{{p: {share * r / (1 - share)!r}, r: {r!r}}}"
 
 
+@pytest.mark.needs_extension("loss_models")
 @pytest.mark.few(2)
 @pytest.mark.parametrize(("stiffness", "share", "packets", "hold", "zero"), PAIR)
 def test_the_growth_of_second_moments_is_that_of_the_references(
@@ -60,7 +61,7 @@ def test_of_many_peers_it_is_an_estimate_that_says_so(
     found = decided(topology(5, stiffness, loss=burst(0.01, packets)))
     assert not found.exact and found.error is not None
     assert found.verdict == f"probably {'un' if three > 1 else ''}stable in mean square"
-    told = re.search(r"estimate: moments of at most 3 .* with 2 the radius is ([\d.]+)", found.notes[0])
+    told = re.search(r"estimate: joint moments of at most 3 .* with 2 the radius is ([\d.]+)", found.notes[0])
     # The reference leaves out moments of more tags in each channel's own basis: not quite the same set.
     assert told and float(told[1]) == pytest.approx(two, abs=5e-8)
     assert found.mean_square_radius == pytest.approx(three, abs=1e-9 if packets == 3 else found.error)
@@ -70,8 +71,8 @@ def test_of_many_peers_it_is_an_estimate_that_says_so(
 @pytest.mark.parametrize(
     ("loss", "proof"),
     [
-        ("10 %", "second moments bounded on either side"),
-        ("{p: 1 %, r: 10 %}", "second moments by iteration in floats, not proved"),
+        ("10 %", "second moments bounded on both sides"),
+        ("{p: 1 %, r: 10 %}", "second moments by floating-point iteration, not proved"),
     ],
 )
 def test_a_crossing_claims_no_more_than_its_moments_do(loss: str, proof: str) -> None:
@@ -95,10 +96,11 @@ def over_two_links(loss: str, other: str) -> str:
     return f"{text}  wan: {{clock: network, delay: 12 ms, loss: {other}}}\n"
 
 
+@pytest.mark.needs_extension("loss_models")
 def test_links_whose_packets_are_due_at_different_instants_are_judged_together() -> None:
     """Bursts that end at once are losses one by one, which are judged in another way."""
     nearly = radius(over_two_links("{p: 10 %, r: 89.999999 %}", "5 %"))
     assert nearly == pytest.approx(radius(over_two_links("10 %", "5 %")), rel=1e-8)
     found = decided(over_two_links("10 %, on_loss: zero", "5 %"))
     assert found.verdict == "not judged"
-    assert "values that stand in beside packets of another link or delay" in found.notes[0]
+    assert "substituted values together with packets of another link or delay" in found.notes[0]

@@ -77,6 +77,7 @@ def radius(text: str) -> float:
     return found.mean_square_radius
 
 
+@pytest.mark.needs_extension("loss_models")
 @pytest.mark.few(3)
 @pytest.mark.parametrize(("peers", "peer_type", "stiffness", "hold", "zero", "digits"), INDEPENDENT)
 def test_the_growth_of_second_moments_is_that_of_the_references(
@@ -87,6 +88,7 @@ def test_the_growth_of_second_moments_is_that_of_the_references(
         assert found == pytest.approx(expected, abs=max(digits, 1e-12))
 
 
+@pytest.mark.needs_extension("loss_models")
 @pytest.mark.few(2)
 @pytest.mark.parametrize(("peers", "mass", "loss", "on_loss", "stiffness"), CRITICAL)
 def test_where_a_reference_is_critical_the_radius_is_1(
@@ -107,10 +109,10 @@ def by_critical(system: Model, near: float) -> tuple[float, float]:
 
 
 def by_margins(system: Model, near: float) -> tuple[float, float]:
-    from apc.frame.numeric_model import prepare
-    from apc.parameter_studies.margins import Margins, network_margins
+    from apc.lifting.numeric_model import numeric_model
+    from apc.studies.margins import Margins, network_margins
 
-    found = network_margins(system, prepare(system), Margins((), ""))
+    found = network_margins(numeric_model(system), Margins((), ""))
     row = next(row for row in found.rows if row.parameter == STIFFNESS)
     assert row.value is not None and row.error is not None
     assert row.gain_margin == row.value / 500
@@ -135,6 +137,7 @@ def by_box(system: Model, near: float) -> tuple[float, float]:
 HOLD_10, ZERO_20 = ("loss: 10 %", 1143.224858916119), ("loss: 20 %, on_loss: zero", 1354.3615910782753)
 
 
+@pytest.mark.needs_extension("loss_models")
 @pytest.mark.few(2)
 @pytest.mark.parametrize(
     ("coupling_term", "more", "stiffness"),
@@ -165,7 +168,7 @@ def test_a_region_over_loss_ends_where_the_references_do() -> None:
     assert [*ends.values()] == pytest.approx([1096.4108683656323, 1383.5619], rel=1e-6)
     assert (found.criterion, curve.mode, found.limitations) == ("mean-square", "mean-square", ())
     assert found.contains(0.3, 1200.0) and not found.contains(0.05, 1200.0)
-    assert str(found).splitlines()[1] == "  judged in mean square, over the network as it is"
+    assert str(found).splitlines()[1] == "  criterion: mean-square stability over the lossy network"
 
 
 def test_loss_is_a_parameter_like_others() -> None:
@@ -179,6 +182,7 @@ def test_loss_is_a_parameter_like_others() -> None:
     np.testing.assert_allclose(swept.column("mean_square_radius"), expected, rtol=1e-9)
 
 
+@pytest.mark.needs_extension("loss_models")
 @pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("peers", "nominal"), [(2, 0.9028182673009955), (3, 0.9161770691168368), (5, 0.9198995414489803)]
@@ -204,7 +208,7 @@ def test_a_proof_is_told_where_it_is_asked_for_and_there_is_one(
 ) -> None:
     text = topology(3, stiffness, loss=loss)
     found = decided(text, certify=True)
-    how = f"proved {proved} in mean square, by floats whose every rounding is bounded" if proved else ""
+    how = f"proved {proved} in mean square, in floating point with rigorous error bounds" if proved else ""
     assert (str(found.proof), str(decided(text).proof)) == (how, "")
     assert any(text.startswith("not proved") for text in found.notes) == (not proved)
 
@@ -212,12 +216,12 @@ def test_a_proof_is_told_where_it_is_asked_for_and_there_is_one(
 @pytest.mark.parametrize(
     ("more", "why"),
     [
-        ("loss: 100 %", "lan loses everything"),
-        ("loss: {p: 1 %, r: 0 %}", "never end (r = 0)"),
-        ("loss: 1 %, jitter: 9 ms, reorder: all", "overtaken and count all the same"),
+        ("loss: 100 %", "every packet of lan is lost"),
+        ("loss: {p: 1 %, r: 0 %}", "without end (r = 0)"),
+        ("loss: 1 %, jitter: 9 ms, reorder: all", "reordered packets of lan that are accepted"),
         ("loss: 1 %, jitter: 1 ms, on_loss: zero", "together with on_loss: zero"),
         ("loss: {p: 1 %, r: 10 %}, jitter: 1 ms", "jitter and bursts of lan"),
-        ("jitter: 24 ms", "covariances of random losses and delays that drive loops of"),
+        ("jitter: 24 ms", "covariances of losses and delays with"),
     ],
 )
 def test_what_is_not_served_is_not_judged_and_says_why(more: str, why: str) -> None:
@@ -226,16 +230,16 @@ def test_what_is_not_served_is_not_judged_and_says_why(more: str, why: str) -> N
     assert found is not None
     assert (found.verdict, found.stable, found.mean_square_radius) == ("not judged", None, None)
     assert why in found.notes[0]
-    with pytest.raises(ApcError, match="E898 the topology can't be judged in mean square") as error:
+    with pytest.raises(ApcError, match="E898 no mean-square verdict") as error:
         apc.critical(system, STIFFNESS)
-    assert error.value.mistakes[0].hint == "--criterion nominal"
+    assert error.value.mistakes[0].fix == "--criterion nominal"
 
 
 def test_what_cannot_be_varied_is_refused_with_what_can() -> None:
     system = compiled(unreliable("loss: 1 %"))
-    with pytest.raises(ApcError, match=r"E898 .* lan loses everything") as error:
+    with pytest.raises(ApcError, match=r"E898 .* every packet of lan is lost") as error:
         apc.critical(system, "lan.loss", lower="99 %", upper="100 %")
-    assert error.value.mistakes[0].hint == "a narrower range between --lower and --upper"
+    assert error.value.mistakes[0].advice == "narrow the range between --lower and --upper"
     with pytest.raises(ApcError, match=r"E898 lan\.delay can't be varied in mean square"):
         apc.critical(system, "lan.delay")
     for name, value in (("lan.loss", "101 %"), ("lan.loss", "-1 %")):

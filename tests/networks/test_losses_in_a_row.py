@@ -15,14 +15,14 @@ import pytest
 import apc
 from apc.__main__ import run
 from apc.compiler.errors import ApcError
-from apc.frame.numeric_model import prepare
-from apc.mean_square.dropout_bounds import ConsecutiveLosses, worst_case
+from apc.extensions.loss_models.dropout_bounds import ConsecutiveLosses, worst_case
+from apc.lifting.numeric_model import numeric_model
 from tests.held_topologies import frames, growth, system_of, topology
 from tests.topologies import replaced
 
 
 def losses(text: str) -> ConsecutiveLosses:
-    return worst_case(system_of(text), prepare(system_of(text)))
+    return worst_case(numeric_model(system_of(text)))
 
 
 def longest(pattern: tuple[bool, ...]) -> int:
@@ -62,9 +62,7 @@ def test_who_shakes_or_drifts_anyhow_is_told_so() -> None:
     text = topology(2, 0.0).replace("1000 N/m", "0 N/m").replace("0.6 kg, damping: 5", "0.6 kg, damping: 0")
     found = losses(text)
     assert (found.certified, found.unstable_pattern) == (None, None)
-    assert found.note.startswith(
-        "the topology is not proved to settle with no packet lost; no periodic pattern"
-    )
+    assert found.note.startswith("stability without packet loss is not proved; no unstable periodic")
 
 
 @pytest.mark.few(1)
@@ -117,7 +115,7 @@ def test_groups_rings_and_stars_are_what_is_written_peer_by_peer_and_edge_by_edg
 
 @pytest.mark.parametrize("stiffness", [0.0, 1e-3])
 def test_who_feels_nothing_of_the_others_bears_any_losses(stiffness: float) -> None:
-    note = "1,000 losses in a row are harmless, where counting ends"
+    note = "at least 1,000 consecutive losses are harmless; more were not analyzed"
     assert losses(topology(3, stiffness)) == ConsecutiveLosses(1000, None, None, note)
 
 
@@ -130,7 +128,10 @@ TWICE = (
 @pytest.mark.parametrize(
     ("text", "why"),
     [
-        (topology(3, 500.0, more=", on_loss: zero"), "lan takes no difference where a packet is missed"),
+        (
+            topology(3, 500.0, more=", on_loss: zero"),
+            "lan does not set the difference to 0 for a lost packet",
+        ),
         (topology(3, 500.0, more=", jitter: 2 ms"), "lan has jitter"),
         (TWICE, "lan sends more than one packet in a frame of 0.016 s"),
         # Of two packets between ticks of the forces one is heard only where the other is lost.
@@ -140,14 +141,14 @@ TWICE = (
         ),
         (
             topology(200, 500.0, more=", graph: ring"),
-            "200 peers on a graph that is not complete are too many",
+            "200 peers on a graph that is not complete; the limit is",
         ),
     ],
 )
 def test_what_is_not_served_is_left_open_and_named(text: str, why: str) -> None:
     found = losses(text)
     assert (found.certified, found.unstable_pattern, found.growth) == (None, None, None)
-    assert found.note.startswith("losses in a row are left open: ") and why in found.note
+    assert found.note.startswith("consecutive losses are undecided: ") and why in found.note
 
 
 @pytest.mark.whole
@@ -181,7 +182,7 @@ def test_the_command_plays_the_pattern_or_says_why_not(
     assert json.loads(capsys.readouterr().out)["topology"] == "lossy"
     path.write_text(topology(2, 50.0), encoding="utf-8")
     assert run(words) == 1
-    message = "E897 --trace-of worst has nothing to play: no periodic pattern tried, of fewer than 40 losses"
+    message = "E897 --trace-of worst has no pattern: no unstable periodic loss pattern found with fewer"
     assert message in capsys.readouterr().err
-    with pytest.raises(ApcError, match=r"E897 --trace-of worst has nothing to play: .* lan has jitter"):
+    with pytest.raises(ApcError, match=r"E897 --trace-of worst has no pattern: .* lan has jitter"):
         apc.simulate(system_of(topology(3, 300.0, more=", jitter: 1 ms")), trace_of="worst")

@@ -17,7 +17,7 @@ import apc
 from apc.compiler.errors import ApcError
 from apc.mean_square.receiver_memory import arrives
 from apc.network.channel import PARETO_MOST, ChannelLaw, PacketSource, channel_law, deviates
-from apc.network.packet_schedule import Listener
+from apc.network.packet_schedule import LinkReceiver
 from apc.simulation.settings import Settings
 from apc.simulation.simulation import prepare
 from tests.lossy import BURSTS, RELIABLE, delays, effective, recorded, unreliable
@@ -135,9 +135,9 @@ def test_the_latest_packets_of_a_table_have_arrived_at_the_latest_tick_and_none_
 
 def listener(
     law: ChannelLaw, *pairs: tuple[int, int], newest: bool = True, quantum: Fraction = MS
-) -> Listener:
+) -> LinkReceiver:
     source = PacketSource(law, "lan", pairs or [(0, 1)])
-    return Listener(source, newest=newest, phase=0, period=8, delay=8, quantum=quantum)
+    return LinkReceiver(source, newest=newest, phase=0, period=8, delay=8, quantum=quantum)
 
 
 @pytest.mark.few(1)
@@ -176,9 +176,12 @@ def test_ticks_see_what_looking_at_every_packet_finds_however_time_is_cut(
 @pytest.mark.parametrize(
     ("changes", "why"),
     [
-        ([("count: 3", "count: 2000")], "lan is unreliable, and 2000 peers .* 3998000 ways"),
-        ([("delay: 8 ms,", "delay: 9000.000000001 ms,")], "lan is unreliable, .* parts of 1e-12 s"),
-        ([("delay: 8 ms,", "delay: 9000.000000001 ms, on_loss: zero,")], "lan .* parts of 1e-12 s"),
+        (
+            [("count: 3", "count: 2000")],
+            "lan is unreliable; 2000 completely connected peers .* 3998000 directed",
+        ),
+        ([("delay: 8 ms,", "delay: 9000.000000001 ms,")], "lan is unreliable; .* multiples of 1e-12 s"),
+        ([("delay: 8 ms,", "delay: 9000.000000001 ms, on_loss: zero,")], "lan .* multiples of 1e-12 s"),
     ],
 )
 def test_more_than_can_be_kept_is_refused_by_number(changes: list[tuple[str, str]], why: str) -> None:
@@ -188,5 +191,5 @@ def test_more_than_can_be_kept_is_refused_by_number(changes: list[tuple[str, str
 
 def test_the_law_of_a_link_is_no_groups() -> None:
     own = apc.set_parameters(compiled(unreliable("loss: 2 %")), {"user.lan.loss": "5 %"})
-    with pytest.raises(ApcError, match=r"E891 lan\.loss is of a link, .*: user can't set it"):
+    with pytest.raises(ApcError, match=r"E891 lan\.loss belongs to a link and can't be set by user"):
         channel_law(own, own.links[0], Fraction(0))

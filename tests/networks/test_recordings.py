@@ -170,7 +170,7 @@ def test_statistics_of_irtt_agree_with_its_packets(changed: dict[str, int], of: 
     written["stats"] = {"packets_sent": 3, "packets_received": 3, "duplicates": 1}
     assert read_probe(json.dumps(written)) is not None
     written["stats"] |= {"duplicates": 0, "packets_received": 2, **changed}
-    with pytest.raises(ApcError, match=f"E704 the number of {of} in a recording"):
+    with pytest.raises(ApcError, match=f"E704 number of {of} in the recording"):
         read_probe(json.dumps(written))
 
 
@@ -263,10 +263,10 @@ def test_what_the_keys_leave_out_is_said_first(tmp_path: Path) -> None:
     (tmp_path / "t.csv").write_text("delay [ms]\n" + "\n".join(map(repr, slow.tolist())), encoding="utf-8")
     text = str(apc.fit_link(tmp_path / "t.csv", interval="8 ms"))
     head = " ".join(text.partition("  lost ")[0].split())
-    assert "delays follow one another (correlation 1.00" in head
-    assert "spread as none of the distributions" in head
+    assert "consecutive delays are correlated (coefficient 1.00" in head
+    assert "the delays fit none of the distributions" in head
     (tmp_path / "p.txt").write_text(IPUTILS, encoding="utf-8")
-    assert "half of each stands for one way" in str(apc.fit_link(tmp_path / "p.txt"))
+    assert "half of each is used as the delay of one direction" in str(apc.fit_link(tmp_path / "p.txt"))
 
 
 def test_the_entry_is_a_links_and_a_trace_reads_the_same_file(tmp_path: Path) -> None:
@@ -303,10 +303,10 @@ def test_the_command(
     assert rows == ["delay [ms]", "8.2", "15.5", "9.1", "lost", "lost", "lost"]
     Path("none.txt").write_text("root:x:0:0:secret\n", encoding="utf-8")
     for words, message in {
-        "none.txt": "none.txt:1:1: E702 a recording wants packets as ping or irtt wrote them, or a",
+        "none.txt": "none.txt:1:1: E702 recording: expected the output of ping or irtt, or a table",
         "no.txt": "no.txt: E701 the table no.txt does not exist.",
-        "p.txt --out t.json": "t.json: E878 the suffix of --out wants .csv, got .json. Write: --out t.csv",
-        "p.txt --interval 0ms": "--interval: E207 the interval wants a time above 0, got 0ms.",
+        "p.txt --out t.json": "t.json: E878 suffix of --out: expected .csv, got .json. Try: --out t.csv",
+        "p.txt --interval 0ms": "--interval: E207 interval: expected more than 0 s, got 0ms. Try: --interval",
     }.items():
         assert run(["network", *words.split()]) == 1
         told_wrong = " ".join(capsys.readouterr().err.split())
@@ -320,8 +320,8 @@ def test_a_packed_file_is_unpacked_within_bounds(tmp_path: Path) -> None:
         packed.write(b"delay [ms]\n" + b"8\n" * (1 << 25))
     (tmp_path / "torn.json.gz").write_bytes((tmp_path / "bomb.csv.gz").read_bytes()[:100])
     for name, words in (
-        ("bomb.csv.gz", "unpacks to more than 64 MiB"),
-        ("torn.json.gz", "no whole gzip file"),
+        ("bomb.csv.gz", "is larger than 64 MiB when unpacked"),
+        ("torn.json.gz", "not a complete gzip file"),
     ):
         with pytest.raises(ApcError, match=words):
             fit_recording(tmp_path / name)

@@ -26,6 +26,7 @@ def metres(text: str) -> float:
 
 
 # By independent programs: users, K_T in N/m, 1 N² a tick of 1 ms at each device, every packet on time.
+@pytest.mark.needs_extension("loss_models")
 @pytest.mark.few(2)
 @pytest.mark.parametrize(
     ("count", "stiffness", "expected"),
@@ -47,6 +48,7 @@ def test_with_next_to_no_loss_the_error_is_that_of_an_ideal_network(
 PATH = dict.fromkeys([(0, 1), (1, 0), (1, 2), (2, 1)], 1.0)
 
 
+@pytest.mark.needs_extension("loss_models")
 @pytest.mark.few(2)
 @pytest.mark.parametrize(
     ("text", "more", "law"),
@@ -87,7 +89,7 @@ def test_it_is_that_of_moments_followed_event_by_event(text: str, more: dict[str
 def test_of_many_users_bursts_tell_an_estimate_that_is_called_one() -> None:
     found = decided(topology(5, 500.0, loss="{p: 0.3 %, r: 30 %}"))
     assert found.rms_error_m == pytest.approx(metres(topology(5, 500.0, loss="1e-9 %")), rel=0.01)
-    assert any("an estimate: moments of at most 3 channels' states together" in note for note in found.notes)
+    assert any("estimate: joint moments of at most 3 channel states" in note for note in found.notes)
 
 
 @pytest.mark.few(1)
@@ -112,7 +114,7 @@ def test_a_force_moves_all_that_is_rigidly_connected_with_a_device() -> None:
     heavier = metres(replaced(topology(3, 500.0), ("mass: 0.1 kg", "mass: 0.18 kg")))
     assert metres(geared) == pytest.approx(heavier, rel=1e-12)
     found = decided(replaced(geared, ("ratio: 1", "ratio: 2")))
-    why = "device moves with masses that move otherwise, and a hand may hold any of them (user)"
+    why = "device is coupled to masses with other motions, so the device is not unique (user)"
     assert found.rms_error_m is None and any(note.endswith(why) for note in found.notes)
 
 
@@ -121,13 +123,13 @@ def test_a_force_moves_all_that_is_rigidly_connected_with_a_device() -> None:
     [
         (
             ("  cube:", "  glove: {mass: 1 kg, damping: 1 N*s/m}\n  cube:"),
-            "a hand may hold any of device, glove (user)",
+            "the device is not unique: device, glove (user)",
         ),
         (
             ("stiffness: 500.0", "stiffness: 0"),
-            "nothing holds the copies together: what they differ by grows for ever",
+            "the object copies are not coupled, so their difference grows without bound",
         ),
-        (("stiffness: 500.0", "stiffness: 2000"), "only where second moments die out"),
+        (("stiffness: 500.0", "stiffness: 2000"), "available only if second moments decay"),
     ],
 )
 def test_where_there_is_none_it_says_why(change: tuple[str, str], why: str) -> None:

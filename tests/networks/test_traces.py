@@ -24,6 +24,7 @@ def decided(folder: Path, rows: str, more: str = "", peers: int = 3) -> MeanSqua
     return found
 
 
+@pytest.mark.needs_extension("loss_models")
 @pytest.mark.few(4)
 @pytest.mark.parametrize("delay", NOMINAL)
 @pytest.mark.parametrize("count", [1, 2, 3, 40])
@@ -36,6 +37,7 @@ def test_equal_recorded_delays_are_a_nominal_delay(tmp_path: Path, delay: str, c
     assert abs(found.mean_square_radius - NOMINAL[delay] ** 2) <= 1e-12 + found.error
 
 
+@pytest.mark.needs_extension("loss_models")
 @pytest.mark.parametrize("received", [(1, 0), (1, 0, 0, 1, 0), (1, 1, 1, 0, 0, 0, 0)])
 def test_recorded_losses_are_frames_multiplied_by_hand(tmp_path: Path, received: tuple[int, ...]) -> None:
     found = decided(tmp_path, "".join("8\n" if one else "lost\n" for one in received), peers=2)
@@ -53,11 +55,11 @@ def test_many_recorded_delays_are_told_with_how_they_were_found_and_too_many_are
     assert found.mean_square_radius == pytest.approx(NOMINAL["8"] ** 2, rel=1e-3)
     assert any("1,000 frames" in note for note in found.notes)
     assert found.rms_error_m is None
-    assert "root mean square error of copies: it is not worked out over recorded delays" in found.notes
+    assert "root mean square error of copies: it is not computed for recorded delays" in found.notes
     found = decided(tmp_path, "8\n9\n" * 10_001)
     assert found.verdict == "not judged" and "20,002 frames" in found.notes[0]
 
 
 def test_what_is_never_heard_is_not_judged(tmp_path: Path) -> None:
     [*_, why] = decided(tmp_path, "lost\nlost\n").notes[0].split("; ")
-    assert why.endswith("a trace of losses only: nothing is ever heard")
+    assert why.endswith("the trace has only losses")

@@ -15,7 +15,7 @@ import pytest
 
 from apc.compiler.errors import ApcError
 from apc.realtime.packets import Address, Data, Hello, HelloReply, Post
-from apc.realtime.peer import AT_ONCE, KNOCK, NANO, PeerLoop
+from apc.realtime.peer import AT_ONCE, HELLO_PERIOD, NANO, PeerLoop
 from tests.fuzz.packets import run_packets
 from tests.surfaces.wire import HOUR, SOON, Other, Wire, loop_at, send_packets
 from tests.topologies import AVERAGE, compiled, replaced
@@ -156,13 +156,13 @@ def test_a_peer_that_is_started_again_is_heard_and_what_it_was_before_is_not(
     assert loop.post.nonces[1] == others[0].post.nonce
     for count in (1, 2):
         repeated.send(wire.time + SOON, count, (0.75,) * width)
-        loop.take_in(wire.time + KNOCK)
+        loop.take_in(wire.time + HELLO_PERIOD)
     for _, datagram, address in before:
         wire.send(datagram, address)
-    loop.take_in(wire.time + KNOCK)
+    loop.take_in(wire.time + HELLO_PERIOD)
     assert loop.post.nonces[1] == repeated.post.nonce
     assert [row[1:3] for row in loop.player.arrivals] == [(1, 0), (1, 2)]
-    assert set(loop.post.dropped) == {"forged", "heard before"}
+    assert set(loop.post.dropped) == {"forged", "duplicate"}
 
 
 def test_nobody_is_there_who_says_what_was_said_in_another_session(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -173,7 +173,7 @@ def test_nobody_is_there_who_says_what_was_said_in_another_session(monkeypatch: 
     for _ in range(10):
         for _, datagram, address in recorded:
             wire.send(datagram, address, wire.time + NANO // 100)
-    with pytest.raises(ApcError, match=r"E972 user\[2\], user\[3\] did not say within 1 s"):
+    with pytest.raises(ApcError, match=r"E972 no start time received from user\[2\], user\[3\] within 1 s"):
         loop.meet(1)
     assert not loop.session
 
@@ -223,7 +223,7 @@ def test_a_ticks_packets_are_those_that_had_come(monkeypatch: pytest.MonkeyPatch
     def newest(at: int) -> int:
         """Return the packet that a tick sees at the end of a period."""
         player.instant = at * period
-        player._sees(0, 0, ())
+        player._packets_at_tick(0, 0, ())
         return int(player.newest[0][coupling_term])
 
     for count, came in ((3, 3 * period + 1), (2, 3 * period + 2)):
@@ -240,7 +240,7 @@ def test_a_ticks_packets_are_those_that_had_come(monkeypatch: pytest.MonkeyPatch
     ):
         player.receive(Data(sender, 0, link, count, given), came)
     assert newest(5) == 3
-    assert loop.post.dropped == {"heard before": 1, "early": 1, "late": 1, "malformed": 3}
+    assert loop.post.dropped == {"duplicate": 1, "early": 1, "late": 1, "malformed": 3}
     assert [row[2] for row in player.arrivals] == [3, 2, 6]
     assert newest(6) == 6
     before, noise = player.packets.copy(), random.Random(2)
@@ -249,7 +249,7 @@ def test_a_ticks_packets_are_those_that_had_come(monkeypatch: pytest.MonkeyPatch
         player.receive(Data(1, 0, 0, 6, (noise.random(),) * len(values)), 6 * period)
         player.receive(Data(1, 0, 0, noise.randrange(20, 2**60), values), 6 * period)
         player.receive(Data(1, 0, 0, noise.randrange(1000), values), 2000 * loop.frame_ns)
-    assert loop.post.dropped == {"heard before": 10_000, "early": 10_000, "late": 10_000}
+    assert loop.post.dropped == {"duplicate": 10_000, "early": 10_000, "late": 10_000}
     assert (player.packets == before).all()
     assert len(player.arrivals) == 3
 

@@ -1,4 +1,4 @@
-"""Claims about `apc.processes`: processes end when they are let go, and a lost one is told."""
+"""Claims about `apc.support.processes`: processes end when they are let go, and a lost one is told."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ import pytest
 
 from apc.benchmark.scale import scale
 from apc.compiler.errors import ApcError
-from apc.processes import local_processes, model_bytes
 from apc.simulation.monte_carlo import simulate_many
 from apc.simulation.settings import Settings
-from apc.sweeps.grid import build_grid, parse_axis
-from apc.sweeps.resumable_sweep import LOST, sweep
-from apc.sweeps.work import Work, compute_part
+from apc.studies.grid import build_grid, parse_axis
+from apc.studies.resumable_sweep import LOST, sweep
+from apc.studies.work import Work, compute_part
+from apc.support.processes import local_processes, model_bytes
 from tests.sweeping import CHEAP, alive, children, parts
 from tests.topologies import AVERAGE, compiled, replaced
 
@@ -62,10 +62,10 @@ def test_processes_end_at_once_whatever_they_do() -> None:
 STARTING = """\
 import sys
 from apc.__main__ import run
-from apc.app.worker_process import Desk
+from apc.app.worker_process import SectionWorker
 from apc.app.sections import Task
-from apc.inputs import open_topology
-from apc.processes import model_bytes
+from apc.inputs.open_model import open_topology
+from apc.support.processes import model_bytes
 
 if __name__ == "__main__":
     over = ["--over", "contact.stiffness=1 N/m:2 N/m:130"]
@@ -78,8 +78,8 @@ if __name__ == "__main__":
         run(["run", "topology.yaml", "--duration", "40 ms"]),
     ]
     model = model_bytes(open_topology("topology.yaml", ()))
-    desk = Desk(model, ("motion",), lambda call, _: call(), lambda *_: None)
-    desk.ask(Task("motion", (), None))
+    desk = SectionWorker(model, ("motion",), lambda call, _: call(), lambda *_: None)
+    desk.submit(Task("motion", (), None))
     desk.close()
     raise SystemExit(any(ran))
 """
@@ -113,7 +113,7 @@ def test_a_process_stopped_from_outside_is_told_and_finished_parts_are_kept(tmp_
             for pid in set(workers_of_mine()) - before:
                 os.kill(pid, signal.SIGKILL)
 
-    with pytest.raises(ApcError, match="E889 a process that computed ended without a word"):
+    with pytest.raises(ApcError, match="E889 a worker process exited unexpectedly"):
         sweep(MODEL, {"it.stiffness": "1 N/m:9 kN/m:1000"}, out=tmp_path / "r.csv", jobs=2, progress=stop)
     assert 1 <= len(parts(tmp_path / "r.csv")) < 16
 
@@ -139,9 +139,7 @@ def test_a_number_of_peers_whose_process_is_lost_is_refused_and_the_others_are_t
     monkeypatch.setattr("apc.benchmark.scale._measure", _lost_at_four)
     found = scale(tmp_path / "topology.yaml", [4, 5])
     assert list(found.rows) == [5]
-    assert found.refused == (
-        (4, "the process that measured it ended without a word: stopped from outside, or out of memory"),
-    )
+    assert found.refused == ((4, "the measuring process exited unexpectedly: stopped, or out of memory"),)
 
 
 def _lost_at_four(_: Path, count: int) -> int:

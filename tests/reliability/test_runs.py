@@ -17,9 +17,9 @@ import pytest
 
 import apc
 from apc.compiler.errors import ApcError
-from apc.processes import digest_of
 from apc.realtime.peer_run import PeerRun, run_of, write_run
 from apc.realtime.run_folder import read_run
+from apc.support.processes import digest_of
 from tests.fuzz.models import recorded
 from tests.surfaces.wire import Wire, loop_at
 from tests.topologies import AVERAGE, compiled, told
@@ -63,34 +63,34 @@ def put(place: Any, number: float) -> Callable[[Any], Any]:
 @pytest.mark.parametrize(
     ("name", "change", "why"),
     [
-        ("time", put(3, math.inf), "a time or signal is no finite number"),
+        ("time", put(3, math.inf), "a time or signal is not finite"),
         ("time", put(3, 0.0), "its times do not increase"),
-        ("time", put(-1, 1e9), "it leaves out a frame or more"),
-        ("time", lambda array: array[:-1], "it has not one value of each signal at each time"),
+        ("time", put(-1, 1e9), "a frame is missing"),
+        ("time", lambda array: array[:-1], "the numbers of values and times differ"),
         ("values", lambda array: array.ravel(), "its values has 1 dimensions, not 2"),
-        ("delayed", put(0, -1.0), "a tick began, or took, no time there is"),
-        ("took", put(0, math.inf), "a tick began, or took, no time there is"),
-        ("took", lambda array: array[1:], "its ticks did not begin as often as they ended"),
-        ("arrivals", put((0, 0), 1), "a packet came from where none comes"),
-        ("arrivals", put((0, 2), 2**62), "a way has more than 10,000,000 packets"),
-        ("arrivals", put((0, 3), -1), "a packet has no time that there is"),
-        ("arrivals", put((0, 4), 2**63 - 1), "a packet came at no time that there is"),
-        ("arrivals", lambda array: array[:, 1:], "what came is not told in five numbers"),
-        ("packets0", put((0, 0), -2), "a packet has a number that none has"),
-        ("packets0", lambda array: array[:, :0], "it hears other peers than the topology's"),
-        ("missing0", lambda array: array.astype(np.int64), "its missing0 is no array of |b1"),
+        ("delayed", put(0, -1.0), "a time of a tick is negative or not finite"),
+        ("took", put(0, math.inf), "a time of a tick is negative or not finite"),
+        ("took", lambda array: array[1:], "the numbers of begun and completed ticks differ"),
+        ("arrivals", put((0, 0), 1), "a packet is from an unconnected peer"),
+        ("arrivals", put((0, 2), 2**62), "a directed connection has more than 10,000,000 packets"),
+        ("arrivals", put((0, 3), -1), "a packet has an invalid time"),
+        ("arrivals", put((0, 4), 2**63 - 1), "a packet has an invalid arrival time"),
+        ("arrivals", lambda array: array[:, 1:], "an arrival does not have five numbers"),
+        ("packets0", put((0, 0), -2), "a packet has an invalid number"),
+        ("packets0", lambda array: array[:, :0], "its senders are not those of the topology"),
+        ("missing0", lambda array: array.astype(np.int64), "its missing0 is not an array of |b1"),
         ("number", lambda _: 1, "the topology has no such peer"),
         ("name", lambda _: "../../x", "the topology has no such peer"),
         ("first", lambda _: -1, "it joins after the end"),
         ("signals", lambda listed: listed[1:], "its signals are not those of the topology"),
-        ("dropped", lambda _: {"late": -1}, "a count is negative"),
-        ("dropped", lambda _: {"x": 1}, "datagrams are dropped for no known reason"),
-        ("sent", lambda _: {0: {1: -1}}, "a count is negative"),
-        ("sent", lambda _: {9: {1: 1}}, "it tells of a peer or link that isn't there"),
-        ("offsets", lambda _: {9: [0.0, 0.0]}, "it tells of a peer or link that isn't there"),
-        ("offsets", lambda _: {1: [math.nan, 0.0]}, "what it tells is not what apc run writes"),
-        ("stopped", lambda _: 1, "what it tells is not what apc run writes"),
-        ("not_granted", lambda _: ["\x1b[2J"], "what it tells is not what apc run writes"),
+        ("dropped", lambda _: {"late": -1}, "a count is out of range"),
+        ("dropped", lambda _: {"x": 1}, "the reason of a dropped datagram is unknown"),
+        ("sent", lambda _: {0: {1: -1}}, "a count is out of range"),
+        ("sent", lambda _: {9: {1: 1}}, "it names an unknown peer or link"),
+        ("offsets", lambda _: {9: [0.0, 0.0]}, "it names an unknown peer or link"),
+        ("offsets", lambda _: {1: [math.nan, 0.0]}, "its record was not written by apc run"),
+        ("stopped", lambda _: 1, "its record was not written by apc run"),
+        ("not_granted", lambda _: ["\x1b[2J"], "its record was not written by apc run"),
     ],
 )
 def test_what_no_peer_of_the_topology_can_have_done_is_refused(
@@ -99,14 +99,14 @@ def test_what_no_peer_of_the_topology_can_have_done_is_refused(
     assert len(read_run(stored).peers) == 2
     changed(stored, **{name: change})
     (message,) = told(read_run, stored)
-    assert message.startswith(f"{stored / 'user-1.npz'}: E973 is no peer of this run: {why}")
+    assert message.startswith(f"{stored / 'user-1.npz'}: E973 is not a peer of this run: {why}")
 
 
 def test_a_run_beside_another_topology_is_refused(stored: Path) -> None:
     """One of the same structure, whose numbers differ: what happened would be laid beside its motion."""
     found = apc.load(stored / "topology.apc")
     apc.save(apc.set_parameters(found, {"coordination.stiffness": "600 N/m"}), stored / "topology.apc")
-    assert "E973 its topology.apc is not the topology that was played" in told(lambda: read_run(stored))[0]
+    assert "E973 its topology.apc is not the topology of the run" in told(lambda: read_run(stored))[0]
 
 
 def test_what_is_no_file_of_a_peer_is_refused_at_once(stored: Path) -> None:
@@ -115,15 +115,15 @@ def test_what_is_no_file_of_a_peer_is_refused_at_once(stored: Path) -> None:
     path.write_bytes(
         bomb.getvalue().replace((8 << 20).to_bytes(4, "little"), (1 << 31).to_bytes(4, "little"))
     )
-    assert "E973 is no peer of this run: it unpacks to more than 1024 MiB." in told(read_run, stored)[0]
+    assert "E973 is not a peer of this run: it unpacks to more than 1024 MiB." in told(read_run, stored)[0]
     path.unlink()
     os.mkfifo(path)  # who opens it waits for ever
-    assert "E973 is no peer of this run: is a device, pipe or socket." in told(read_run, stored)[0]
+    assert "E973 is not a peer of this run: is a device, pipe or socket." in told(read_run, stored)[0]
     path.unlink()
     path.symlink_to("user-2.npz")
-    assert "E973 holds a peer twice" in told(read_run, stored)[0]
+    assert "E973 contains a peer twice" in told(read_run, stored)[0]
     (stored / "user-3.npz").symlink_to("user-2.npz")
-    assert "E973 holds 3 peers of a topology with 2" in told(read_run, stored)[0]
+    assert "E973 has 3 peers of a topology with 2" in told(read_run, stored)[0]
 
 
 def test_a_run_is_not_written_to_where_links_in_its_folder_lead(stored: Path, tmp_path: Path) -> None:
@@ -182,7 +182,7 @@ def test_a_run_is_put_in_place_whole_or_not_at_all(tmp_path: Path, monkeypatch: 
     monkeypatch.setattr(np, "savez_compressed", save)
     (folder / "notes.txt").write_text("mine", encoding="utf-8")
     write_run(folder, topology, [replace(three, session=7)])  # one that plays by itself
-    with pytest.raises(ApcError, match="E973 holds peers that did not play together: of other runs"):
+    with pytest.raises(ApcError, match="E973 has peers of different runs"):
         read_run(folder)
     write_run(folder, topology, later, whole=True)
     assert sorted(written(folder)) == sorted(

@@ -1,4 +1,4 @@
-"""Claims about `apc.threads`."""
+"""Claims about `apc.support.threads`."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_info
 
-from apc.threads import POOLS, single_threaded, start_single_threaded
+from apc.support.threads import POOLS, single_threaded, start_single_threaded
 from tests.topologies import ROOT
 
 
@@ -35,7 +35,7 @@ def _begun(environment: dict[str, str]) -> str:
     """Start a process as a command does; return its numbers of threads and what its environment says."""
     code = (
         "import os\n"
-        "from apc.threads import POOLS, start_single_threaded\n"
+        "from apc.support.threads import POOLS, start_single_threaded\n"
         "start_single_threaded()\n"
         "import numpy, threadpoolctl\n"
         "print({p['num_threads'] for p in threadpoolctl.threadpool_info()}, end=' ')\n"

@@ -53,7 +53,7 @@ def write(name: str, text: str) -> None:
 def is_unchanged(capsys: pytest.CaptureFixture[str]) -> bool:
     capsys.readouterr()
     assert run(["compile"]) == 0
-    return "unchanged" in capsys.readouterr().out
+    return "up to date" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -71,8 +71,8 @@ def test_a_change_of_anything_it_was_made_from_is_noticed(
 ) -> None:
     assert is_unchanged(capsys)
     change()
-    message = f"topology.apc: E605 is stale: {shown} has changed since it was compiled."
-    assert told(apc.load, MODEL) == [f"{message} Write: apc compile topology.yaml"]
+    message = f"topology.apc: E605 model is out of date: {shown} has changed."
+    assert told(apc.load, MODEL) == [f"{message} Try: apc compile topology.yaml"]
     assert not is_unchanged(capsys)
     assert apc.load(MODEL).peers == len(TABLE.read_text(encoding="utf-8").splitlines()) - 1
     assert is_unchanged(capsys)
@@ -110,14 +110,14 @@ def test_a_change_of_the_library_is_noticed(
     write("other.yaml", "connector: Flange\n")
     library = {**cache.builtin_files(), "Flange": Path("other.yaml").resolve()}
     monkeypatch.setattr(cache, "builtin_files", lambda: library)
-    assert "is stale: the library's Flange has changed" in told(apc.load, MODEL)[0]
+    assert "model is out of date: the library's Flange has changed" in told(apc.load, MODEL)[0]
     assert not is_unchanged(capsys)
 
 
 def test_what_another_program_compiled_is_compiled_again(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for module in ("apc.inputs", "apc.model_loading"):
+    for module in ("apc.inputs.open_model", "apc.inputs.model_loading"):
         monkeypatch.setattr(f"{module}.program_digest", lambda: "other")
     monkeypatch.setattr(store, "decoded", lambda model: pytest.fail("it is read"))
     assert apc.load(MODEL).peers == 2
@@ -146,9 +146,7 @@ def test_compiling_again_says_unchanged_and_force_compiles_to_the_same_bytes(
     before = MODEL.read_bytes()
     capsys.readouterr()
     assert run(["compile"]) == 0
-    assert capsys.readouterr().out == (
-        "topology.yaml → topology.apc: unchanged, not compiled again (--force does)\n"
-    )
+    assert capsys.readouterr().out == ("topology.yaml → topology.apc: up to date (--force compiles again)\n")
     assert run(["compile", "--force"]) == 0
     assert "unchanged" not in capsys.readouterr().out
     assert MODEL.read_bytes() == before
@@ -179,7 +177,7 @@ def re_load() -> str:
 
 def test_a_folder_that_grew_is_not_walked_to_its_end_and_is_a_change(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(files, "MOST_ENTRIES", 0)
-    assert "E605 is stale: parts/ has changed" in told(apc.load, MODEL)[0]
+    assert "E605 model is out of date: parts/ has changed" in told(apc.load, MODEL)[0]
 
 
 def test_what_could_not_be_read_either_time_is_no_proof() -> None:

@@ -45,13 +45,13 @@ def test_a_file_is_read_up_to_its_limit_and_nothing_is_opened_that_is_none(
         Path(name).symlink_to(target)
     os.mkfifo("pipe")
     assert read_file(Path("link"), 100) == b"x" * 100
-    with pytest.raises(RefusedError, match="is larger than 99 bytes, the most it may have"):
+    with pytest.raises(RefusedError, match="is larger than the limit of 99 bytes"):
         read_file(Path("link"), 99)
     monkeypatch.setattr(files, "_without_waiting", None)  # opening anything would fail otherwise
     for name, words in (
         ("pipe", "is a device, pipe or socket"),
         ("zero", "is a device, pipe or socket"),
-        ("cpu", "is an answer of the system's kernel"),
+        ("cpu", "is a file of the system's kernel"),
         ("", "is a folder"),
         ("none", "does not exist"),
         ("n" * 300, "File name too long"),
@@ -303,8 +303,8 @@ def test_a_model_is_never_compiled_into_what_is_none(topology: Cli) -> None:
     write("own.txt", "mine")
     os.mkfifo("pipe")
     link, special = (
-        f"topology.apc: E601 can't be written: it is {what}. Write: rm topology.apc\n"
-        for what in ("a link to what is no compiled model", "a device, pipe or socket")
+        f"topology.apc: E601 can't be written: it is {what}. Try: rm topology.apc\n"
+        for what in ("a link to a file of another kind", "a device, pipe or socket")
     )
     for target, message in (("own.txt", link), ("new.txt", link), ("pipe", special), ("/dev/zero", special)):
         model.symlink_to(target)
@@ -322,8 +322,8 @@ def test_a_model_is_never_compiled_into_what_is_none(topology: Cli) -> None:
 @pytest.mark.parametrize(
     ("library", "message"),
     [
-        ("/proc/self", "E214 the library folder /proc/self is an answer of the system's kernel."),
-        ("/", "E214 the library folder / holds more than 3 files and folders. Write: library: ./parts"),
+        ("/proc/self", "E214 the library folder /proc/self is a file of the system's kernel."),
+        ("/", "E214 the library folder / holds more than 3 files and folders. Try: library: ./parts"),
         ("deep", "E214 the library folder deep is more than 2 folders deep"),
     ],
 )
@@ -435,7 +435,7 @@ def test_a_link_to_what_a_command_reads_is_refused_and_a_file_that_is_read_only_
     for read in {"network": INPUTS[3:], "schema": (), "new": ()}.get(command[0], INPUTS[:3]):
         for link in (target.symlink_to, target.hardlink_to):
             link(read)
-            assert inputs(line).err.startswith(f"{target}: E616 is read by this command")
+            assert inputs(line).err.startswith(f"{target}: E616 --")
             target.unlink()
     assert [Path(one).read_bytes() for one in INPUTS] == before
     write(name, "mine")
@@ -458,8 +458,8 @@ def test_beside_what_is_asked_for_nothing_that_is_read_is_replaced(
 ) -> None:
     Path(alongside).symlink_to("topology.apc")
     ran = inputs(line)
-    assert ran.code == 1 and f"{alongside}: E616 is read by this command" in ran.err
-    assert "E973 holds the topology that is played" in inputs(f"run {SHORT} --out .").err
+    assert ran.code == 1 and f"{alongside}: E616 --out would replace an input file" in ran.err
+    assert "E973 contains the topology of this run" in inputs(f"run {SHORT} --out .").err
 
 
 @pytest.mark.parametrize(
@@ -467,17 +467,15 @@ def test_beside_what_is_asked_for_nothing_that_is_read_is_replaced(
     [
         (
             "sweep topology.yaml --over contact.stiffness=1N/m:2N/m:2 --out users.csv",
-            "users.csv: E616 is read by this command: --out would replace it. Write: --out users-result.csv",
+            "users.csv: E616 --out would replace an input file. Try: --out users-result.csv",
         ),
         (
             "show topology.txt --out topology.txt",
-            "topology.txt: E616 is read by this command: --out would replace it. Write: --out "
-            "topology-result.txt",
+            "topology.txt: E616 --out would replace an input file. Try: --out topology-result.txt",
         ),
         (
             "simulate topology.yaml --duration 1s --plot a.png --snapshot ./a.png",
-            "a.png: E616 is given to --plot and to --snapshot: the second would replace the first. "
-            "Write: --snapshot a-result.png",
+            "a.png: E616 same file for --plot and --snapshot. Try: --snapshot a-result.png",
         ),
     ],
 )
@@ -487,7 +485,7 @@ def test_what_a_command_reads_it_never_replaces(inputs: Cli, line: str, message:
     assert (Path("users.csv").read_text(), Path("topology.txt").read_text()) == (TABLE, AVERAGE)
     over = {"contact.stiffness": "1 N/m:2 N/m:2"}
     assert told(lambda: apc.sweep("topology.yaml", over, out="users.csv")) == [
-        'users.csv: E616 is read by this command: out would replace it. Write: out="users-result.csv"'
+        'users.csv: E616 out would replace an input file. Try: out="users-result.csv"'
     ]
 
 

@@ -35,7 +35,9 @@ def served(path: Path, *words: str) -> Iterator[str]:
         yield process.stdout.readline().strip()
         process.send_signal(signal.SIGINT)
         _, err = process.communicate(timeout=60)
-        assert (process.returncode, err) == (0, "ended\n"), f"it ended with {process.returncode}: {err}"
+        assert (process.returncode, err) == (0, "starting ...\nended\n"), (
+            f"it ended with {process.returncode}: {err}"
+        )
     finally:
         process.kill()
         process.wait()

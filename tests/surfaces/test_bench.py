@@ -66,8 +66,8 @@ def test_the_front_is_what_nothing_beats_in_both_ways(
 def test_the_report_fits_a_terminal_and_names_the_choice(found: Bench) -> None:
     text = str(found)
     assert max(map(len, text.splitlines())) <= 80
-    assert "analyze chooses modes, which is" in text
-    assert "simulate chooses exact, which is" in text
+    assert "default method of analyze: modes" in text
+    assert "default method of simulate: exact" in text
     analysis = found.comparisons[0]
     for one in analysis.measured:
         assert one.error is None or one.bound is None or one.error <= one.bound
@@ -91,15 +91,15 @@ def test_more_peers_are_measured_each_in_a_process_of_its_own(cli: Cli) -> None:
     assert all(row.memory > 10 * 2**20 for row in grown.rows)
     text = str(grown)
     assert max(map(len, text.splitlines())) <= 80
-    assert "peers of group many, beside 1 of other groups" in text and "3,000" in text
+    assert "peers of group many, with 1 of other groups" in text and "3,000" in text
 
 
 @pytest.mark.whole
 @pytest.mark.parametrize(
     ("topology", "counts", "message"),
     [
-        ("three-users-average", [1], r"E921 leaves nothing to measure: 1 peer of user: .* 2 peers"),
-        ("users-table", [3], "no group of this topology has a count that could grow"),
+        ("three-users-average", [1], r"E921 1 peer of user can't be measured: .* 2 peers"),
+        ("users-table", [3], "no group of this topology has a count that can be varied"),
         ("three-users-average", [], "E921"),
         ("three-users-average", [0], "E921"),
         ("three-users-average", [3, -1], "E921"),
@@ -116,7 +116,7 @@ def test_numbers_of_peers_that_are_none_are_refused(topology: str, counts: list[
 @pytest.mark.parametrize(
     ("plot", "message"),
     [
-        ("bench.txt", "E878 the suffix of --plot"),
+        ("bench.txt", "E878 suffix of --plot"),
         ("bench.png", "E875 matplotlib is not installed"),
         ("nowhere/bench.png", "E601 can't be written: No such file or directory"),
         (".", "E601 can't be written: it is a folder"),
@@ -152,7 +152,7 @@ def test_what_goes_wrong_in_the_end_costs_no_figures(
         monkeypatch.setattr("apc.benchmark.speed_and_error.bench", lambda *_, measured=measured: measured)
         ran = cli(f"bench '{TOPOLOGIES}/template.yaml' {plot}")
         assert ran.code == 1 and all(one in ran.err for one in messages)
-        assert "analyze chooses modes" in ran.out
+        assert "default method of analyze: modes" in ran.out
 
 
 # ---- hard cases ----
@@ -205,18 +205,18 @@ def test_a_case_that_is_wrong_fails(cli: Cli, changes: dict[str, object], messag
     _one_case(**changes)
     ran = cli("bench --hard .")
     assert ran.code == 1 and f"FAILED tiny-device: {message}" in ran.out
-    assert "E922 not every hard case came out right: tiny-device" in ran.err
+    assert "E922 failed reference cases: tiny-device" in ran.err
 
 
-OPEN = "the bound says nothing; the verdict is left open: stable up to a common translation"
+OPEN = "the bound is infinite; the verdict is undecided; expected: stable up to a common translation"
 
 
 @pytest.mark.parametrize(
     ("changes", "failed"),
     [
         ({"spectral_radius_error": math.inf, "stable": None, "verdict": "undecided: …"}, OPEN),
-        ({"spectral_radius": math.nan}, "there is no spectral radius"),
-        ({"spectral_radius_error": math.nan}, "the bound says nothing"),
+        ({"spectral_radius": math.nan}, "no spectral radius"),
+        ({"spectral_radius_error": math.nan}, "the bound is infinite"),
     ],
 )
 def test_what_is_no_number_or_no_verdict_fails_and_is_counted(
@@ -237,21 +237,24 @@ def test_the_report_of_hard_cases_fits_a_terminal(cli: Cli) -> None:
     _one_case()
     ran = cli("bench --hard .")
     assert ran.code == 0 and max(map(len, ran.out.splitlines())) <= 80
-    assert "every bound holds; every verdict is right" in ran.out
+    assert "all bounds hold; all verdicts are correct" in ran.out
     assert "stable*: stable up to a common translation" in ran.out
-    assert "other.yaml has no truth beside it: left out" in ran.out
+    assert "other.yaml excluded: no known result" in ran.out
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
         (None, "does not exist"),
-        ("{", "is not JSON"),
-        ("[]", "the truths wants spectral_radius"),
-        ('{"a": {"spectral_radius": "much"}}', "a wants spectral_radius"),
-        ('{"a": {"spectral_radius": "1/0", "rigid_modes": 1, "verdict": "stable"}}', "a wants spectral"),
-        ('{"a": {"spectral_radius": "1", "rigid_modes": "one", "verdict": "stable"}}', "a wants spectral"),
-        ("{}", "holds no topology whose truth is known"),
+        ("{", "invalid JSON"),
+        ("[]", "reference results: expected spectral_radius"),
+        ('{"a": {"spectral_radius": "much"}}', "a: expected spectral_radius"),
+        ('{"a": {"spectral_radius": "1/0", "rigid_modes": 1, "verdict": "stable"}}', "a: expected spectral"),
+        (
+            '{"a": {"spectral_radius": "1", "rigid_modes": "one", "verdict": "stable"}}',
+            "a: expected spectral",
+        ),
+        ("{}", "has no topology with a reference result"),
     ],
 )
 def test_truths_that_are_none_are_refused(cli: Cli, text: str | None, message: str) -> None:

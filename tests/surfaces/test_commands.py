@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import ast
 import json
+import re
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import click
@@ -20,6 +22,7 @@ from apc.cli.options import Command
 from apc.cli.progress import at_work
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation, visible
 from apc.output.formatting import document, json_text
+from apc.support.remaining_time import RemainingTime
 from tests.commands import Cli, Ran, folder, write
 from tests.topologies import AVERAGE, ROOT, TOPOLOGIES, replaced
 
@@ -35,7 +38,7 @@ def test_from_nothing_to_a_verdict_in_three_commands(cli: Cli) -> None:
     assert cli("new") == Ran(0, "topology.yaml is written. Next: apc compile topology.yaml\n", "")
     compiled, analyzed = cli("compile"), cli("analyze")
     assert (compiled.code, compiled.err, analyzed.code, analyzed.err) == (0, "", 0, "")
-    assert compiled.out.startswith("topology → topology.apc\n  8 states a peer")
+    assert compiled.out.startswith("topology → topology.apc\n  8 states per peer")
     assert analyzed.out.startswith("topology: stable up to a common translation\n")
     assert folder() == ["topology.apc", "topology.yaml"]
 
@@ -44,7 +47,7 @@ def test_new_writes_under_the_name_given_and_overwrites_nothing(cli: Cli) -> Non
     assert cli("new my-topology").code == 0
     assert Path("my-topology.yaml").read_text(encoding="utf-8").count("topology: my-topology") == 1
     write("my-topology.yaml", "mine")
-    message = "my-topology.yaml: E613 exists already and is left as it is. Write: apc new another-name\n"
+    message = "my-topology.yaml: E613 file exists and was not changed. Try: apc new another-name\n"
     assert cli("new my-topology") == Ran(1, "", message)
     assert Path("my-topology.yaml").read_text(encoding="utf-8") == "mine"
 
@@ -53,19 +56,19 @@ def test_new_writes_under_the_name_given_and_overwrites_nothing(cli: Cli) -> Non
 def test_new_takes_a_plain_name_only(cli: Cli, name: str) -> None:
     ran = cli("new", name)
     assert (ran.code, ran.out) == (1, "")
-    assert "E612 a topology's name wants letters, digits, - and _, 63 at most" in ran.err
+    assert "E612 name of a topology: expected letters, digits, - and _ (at most 63" in ran.err
     assert folder() == []
 
 
 def test_check_builds_nothing_and_reports_every_mistake(topology: Cli) -> None:
-    assert topology("check") == Ran(0, "topology.yaml: no mistakes. three-users-average, 3 peers.\n", "")
+    assert topology("check") == Ran(0, "topology.yaml: no errors. three-users-average, 3 peers.\n", "")
     write("topology.yaml", AVERAGE.replace("0.1 kg", "0.1").replace("link: lan", "link: lam"))
     ran = topology("check")
     assert (ran.code, ran.out) == (1, "")
     assert [line for line in ran.err.splitlines() if line.startswith("topology.yaml")] == [
-        "topology.yaml:9:18: E204 mass wants kg, got 0.1 (no unit). Write: mass: 0.1 kg",
-        "topology.yaml:13:109: E206 coordination names link lam, which isn't in links; the nearest is lan. "
-        "Write: lan",
+        "topology.yaml:9:18: E204 mass: expected kg, got 0.1 (no unit). Try: mass: 0.1 kg",
+        "topology.yaml:13:109: E206 coordination: unknown link lam (not in links); the nearest is lan. "
+        "Try: lan",
     ]
     assert folder() == ["topology.yaml"]
 
@@ -88,20 +91,45 @@ def test_json_is_one_document_and_nothing_else(topology: Cli) -> None:
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ("analyse", "No such command 'analyse'."),
+        ("analyse topology.yaml", "No such command 'analyse'. Did you mean 'analyze'?"),
+        ("critcal", "No such command 'critcal'. Did you mean 'critical'?"),
+        ("zzz", "No such command 'zzz'."),
         ("compile --until nowhere", "Invalid value for '--until'"),
         ("analyze --method schur", "Invalid value for '--method'"),
         ("analyze --jsn", "No such option '--jsn'"),
         ("compile a b", "Got unexpected extra argument (b)"),
         ("simulate --jobs 1_0", "is not a whole number"),
         ("simulate --jobs ١", "is not a whole number"),
-        ("bench topology.yaml --hard", "--hard has topologies of its own"),
+        ("bench topology.yaml --hard", "--hard can't be combined with FILE"),
     ],
 )
 def test_a_wrong_call_ends_with_two(cli: Cli, words: str, message: str) -> None:
     ran = cli(words)
     assert (ran.code, ran.out) == (2, "")
     assert message in ran.err.replace("option: --jsn", "option '--jsn'")
+
+
+@pytest.mark.parametrize(
+    ("words", "start"),
+    [
+        ("tune --free {0} --maximize {0}", "--free: E830 range of {0}"),
+        ("critical {0} --over {0}", "--over: E830 range of {0}"),
+        ("critical {0} --over user.count=2:4 --criterion nominal", "apc critical: E996 the criterion"),
+        ("critical {0} --over '{0}=1 N/m:2 N/m'", "apc critical: E831 {0} has two ranges."),
+        ("critical {0} --over user.count=2:3 --upper 9", "--upper: E204 {0}"),
+        ("critical {0} --over user.count=2:3 --lower '9 N/m' --upper '5 N/m'", "apc critical: E833"),
+        ("critical lan.delay --over '{0}=1 N/m:2 N/m'", "apc critical: E995 lan.delay"),
+        ("analyze --box {0}", "--box: E830 range of {0}"),
+        ("analyze --box lan.loss=5", "--box: E830 range of lan.loss"),
+        ("analyze --set lan.loss=5", "--set: E624 lan.loss: expected at most 100 %, got 500 %."),
+    ],
+)
+def test_an_error_names_the_command_or_option_that_was_typed(cli: Cli, words: str, start: str) -> None:
+    lossy = replaced(AVERAGE, ("delay: 8 ms}", "delay: 8 ms, loss: 5 %}"))
+    Path("topology.yaml").write_text(lossy, encoding="utf-8")
+    ran = cli(words.format("coordination.stiffness"))
+    assert ran.code == 1
+    assert ran.err.startswith(start.format("coordination.stiffness"))
 
 
 def test_a_bug_of_ours_ends_with_three_and_keeps_a_report(
@@ -111,9 +139,9 @@ def test_a_bug_of_ours_ends_with_three_and_keeps_a_report(
     monkeypatch.setattr("apc.compiler.pipeline.compile_topology", lambda path: 1 // 0)
     ran = topology("check topology.yaml")
     assert (ran.code, ran.out) == (3, "")
-    assert ran.err.startswith("apc: this is a bug of apc, not of your input; a report is in ")
+    assert ran.err.startswith("apc: internal error, not an error of the input; report: ")
     assert "Traceback" not in ran.err
-    text = Path(ran.err.split(" a report is in ")[1].strip()).read_text(encoding="utf-8")
+    text = Path(ran.err.split(" report: ")[1].strip()).read_text(encoding="utf-8")
     assert "ZeroDivisionError" in text
     assert "arguments: ['check', 'topology.yaml']" in text
 
@@ -131,13 +159,38 @@ def test_help_fits_a_terminal_and_every_command_is_one_of_ours(cli: Cli) -> None
     assert cli("--version") == Ran(0, f"apc {apc.__version__}\n", "")
 
 
+def test_the_help_of_an_option_has_at_most_two_lines_of_80_columns() -> None:
+    context = click.Context(group)
+    for name in group.list_commands(context):
+        command = group.get_command(context, name)
+        assert command is not None
+        formatter = click.HelpFormatter(width=80)
+        command.format_options(click.Context(command, help_option_names=["-h", "--help"]), formatter)
+        rows = re.split(r"^  (?=-)", formatter.getvalue(), flags=re.MULTILINE)[1:]
+        assert len(rows) >= 2
+        # A name of more than 30 columns has a line of its own.
+        assert [row for row in rows if row.count("\n") > (2 + (len(row.splitlines()[0]) < 31))] == [], name
+
+
+def test_the_commands_are_listed_once_by_section_with_complete_sentences(cli: Cli) -> None:
+    shown = cli("--help").out
+    sections = re.findall(r"^(\w+):\n((?:  .*\n)+)", shown, re.MULTILINE)
+    names = ["Options", "Start", "Analyze", "Design", "Simulate", "Network", "Export"]
+    assert [title for title, _ in sections] == names
+    rows = [row.split(maxsplit=1) for _, block in sections[1:] for row in block.splitlines()]
+    assert sorted(name for name, _ in rows) == sorted(
+        name.removesuffix("_command") for name in commands.__all__
+    )
+    assert all(text.endswith(".") and not text.endswith("...") for _, text in rows)
+
+
 @pytest.mark.few(1)
 @pytest.mark.skipif(sys.platform == "win32", reason="a shell of another kind")
 @pytest.mark.parametrize(
     ("line", "code", "told"),
     [
         ("{apc} schema | head -c 1 >/dev/null; exit ${{PIPESTATUS[0]}}", 0, ""),
-        ("{apc} schema >&-", 1, "there is no stdout"),
+        ("{apc} schema >&-", 1, "stdout is closed"),
     ],
 )
 def test_an_output_that_is_closed_is_no_bug(line: str, code: int, told: str) -> None:
@@ -254,7 +307,7 @@ def test_a_name_that_can_be_none_is_one_message(topology: Cli, words: str) -> No
 def test_two_topologies_of_one_model_are_refused_naming_both(cli: Cli) -> None:
     for name in ("x.yaml", "x.yml"):
         write(name, AVERAGE)
-    message = "x.yml: E617 and x.yaml would both be compiled to x.apc. Write: mv x.yml x-2.yml\n"
+    message = "x.yml: E617 same model file, x.apc, as x.yaml. Try: mv x.yml x-2.yml\n"
     assert cli("compile x.yml") == Ran(1, "", message)
     assert not Path("x.apc").exists()
 
@@ -282,6 +335,50 @@ def test_every_command_says_what_its_parts_take_on_stderr(
     assert sum(numbers[:-1]) == pytest.approx(numbers[-1], abs=1.0)
 
 
+@pytest.mark.parametrize("steps", [10, 100, 3000])
+@pytest.mark.parametrize(
+    ("cost", "shown"),
+    [
+        (lambda part: 1.0, True),
+        (lambda part: 1.0 + 0.2 * np.sin(900.0 * part), True),
+        (lambda part: part, False),
+        (lambda part: 1.0 + 5.0 * part, False),
+        (lambda part: part**3, False),
+        (lambda part: np.exp(6.0 * part), False),
+        (lambda part: 2.0 - part, True),
+    ],
+)
+def test_a_remaining_time_is_estimated_only_at_a_steady_rate(
+    cost: Callable[[float], float], shown: bool, steps: int
+) -> None:
+    """A search whose steps become slower had an estimate of 9 s and took 47 s."""
+    ends = np.concatenate([[0.0], np.cumsum([cost((k + 0.5) / steps) for k in range(steps)])])
+    now = [0.0]
+    remaining = RemainingTime(lambda: now[0])
+    pairs = []
+    for done in range(steps + 1):
+        now[0] = float(ends[done])
+        if (estimate := remaining.seconds(done, steps)) is not None:
+            pairs.append((done, estimate, float(ends[-1] - ends[done])))
+    assert bool(pairs) == shown
+    for done, estimate, actual in pairs:
+        assert done >= 0.3 * steps and actual <= 1.5 * estimate + 1.0, (done, estimate, actual)
+    if cost(0.0) == cost(0.7) == 1.0:
+        assert [done for done, _, _ in pairs] == list(range(-(-3 * steps // 10), steps))
+        assert max(abs(estimate - actual) for _, estimate, actual in pairs) <= 1e-9 * steps
+
+
+def test_without_an_estimate_the_elapsed_time_is_printed() -> None:
+    now = [0.0]
+    remaining = RemainingTime(lambda: now[0])
+    texts = []
+    for done in range(5):
+        now[0] = 100.0 * done
+        texts.append(remaining.text(done, 4))
+    assert texts[:3] == ["0 s elapsed", "100 s elapsed", "4 min elapsed, about 4 min left"]
+    assert texts[4] == "7 min elapsed"
+
+
 def test_long_work_says_that_it_goes_on_and_what_may_take_long_is_said_first(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -292,10 +389,10 @@ def test_long_work_says_that_it_goes_on_and_what_may_take_long_is_said_first(
         return len(waits) == 3
 
     monkeypatch.setattr(progress, "QUIET", 10.0)
-    progress._watch("analysing", ended)
-    assert capsys.readouterr().err == "analysing: at work for 10 s\nanalysing: at work for 20 s\n"
+    progress._watch("analyzing", ended)
+    assert capsys.readouterr().err == "analyzing: 10 s elapsed\nanalyzing: 20 s elapsed\n"
     assert waits == [10.0, 10.0, 20.0]
     monkeypatch.setattr(progress, "QUIET", 1000.0)  # no machine is so busy that a second passes for these
-    with at_work("analysing", about=7500.0), at_work("compiling", about=75.0), at_work("measuring"):
+    with at_work("analyzing", about=7500.0), at_work("compiling", about=75.0), at_work("measuring"):
         pass
-    assert capsys.readouterr() == ("", "analysing: this may take 7,500 s\n")
+    assert capsys.readouterr() == ("", "analyzing: estimated time 7,500 s\n")

@@ -9,7 +9,7 @@ import pytest
 import apc
 from apc import cli
 from apc.compiler.source.reading import RENAMED
-from apc.renamed import ARGUMENTS, COMMANDS, FUNCTIONS, OPTIONS
+from apc.support.renamed import ARGUMENTS, COMMANDS, FUNCTIONS, OPTIONS
 from apc.tuning.specification import FORMER, TRANSPARENCY
 from tests.commands import Cli
 from tests.topologies import AVERAGE, replaced
@@ -27,7 +27,9 @@ def topology(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
 @pytest.mark.parametrize("old", COMMANDS)
 def test_a_former_command_names_the_present_one(old: str, topology: str, cli: Cli) -> None:
     ran = cli(old, topology)
-    assert ran.code == 2 and ran.err.strip().endswith(f"Error: apc {old} is named apc {COMMANDS[old]} now.")
+    assert ran.code == 2 and ran.err.strip().endswith(
+        f"Error: unknown command {old}; its present name is {COMMANDS[old]}."
+    )
     assert cli(COMMANDS[old], "--help").code == 0
 
 
@@ -36,13 +38,18 @@ def test_a_former_option_names_the_present_one(
     command: str, old: str, new: str, topology: str, cli: Cli
 ) -> None:
     ran = cli(command or "critical", old, "x", topology)
-    assert ran.code == 2 and ran.err.strip().endswith(f"Error: {old} is named {new} now.")
+    assert ran.code == 2 and ran.err.strip().endswith(
+        f"Error: unknown option {old}; its present name is {new}."
+    )
     assert new in cli(command or "critical", "--help").out
 
 
+@pytest.mark.needs_extension("all")
 def test_a_former_function_names_the_present_one() -> None:
     for old, new in FUNCTIONS.items():
-        with pytest.raises(AttributeError, match=rf"^apc\.{old} is named apc\.{new} now$"):
+        with pytest.raises(
+            AttributeError, match=rf"^unknown function apc\.{old}; its present name is apc\.{new}$"
+        ):
             getattr(apc, old)
         assert callable(getattr(apc, new)) and old not in dir(apc)
 
@@ -52,7 +59,9 @@ def test_a_former_argument_names_the_present_one(topology: str) -> None:
     for function, pairs in ARGUMENTS.items():
         for old, new in pairs.items():
             call = calls.get(function, apc.pareto_front)
-            with pytest.raises(TypeError, match=rf"^apc\.\w+: {old}= is named {new}= now$"):
+            with pytest.raises(
+                TypeError, match=rf"^apc\.\w+: unknown argument {old}=; its present name is {new}=$"
+            ):
                 call(topology, **{old: "x"})  # type: ignore[operator]
 
 
@@ -61,10 +70,11 @@ def test_a_former_metric_names_the_present_one(old: str, topology: str, cli: Cli
     at = " at 5 Hz" if TRANSPARENCY[FORMER[old]][1] else ""
     words = ["--free", "coordination.stiffness=10 N/m:100 N/m", "--time", "1 s"]
     ran = cli("tune", topology, *words, "--minimize", old + at)
-    assert ran.code == 1 and f"E996 {old} is named {FORMER[old]} now." in ran.err
-    assert f'Write: --minimize "{FORMER[old]}{at}"' in ran.err
+    assert ran.code == 1 and f"E996 the present name of {old} is {FORMER[old]}." in ran.err
+    assert f'Try: --minimize "{FORMER[old]}{at}"' in ran.err
 
 
+@pytest.mark.needs_extension("pareto_front")
 @pytest.mark.parametrize(
     ("words", "fix"),
     [
@@ -81,7 +91,7 @@ def test_the_fix_keeps_what_was_written(words: list[str], fix: str, topology: st
     gain = ["--free", "coordination.stiffness=10 N/m:100 N/m", "--time", "1 s"]
     more = [] if "--maximize" in words or "--minimize" in words else ["--maximize", "coordination.stiffness"]
     ran = cli("tune", topology, *gain, *more, *words)
-    assert ran.code == 1 and f"Write: {words[0]} {fix}" in ran.err
+    assert ran.code == 1 and f"Try: {words[0]} {fix}" in ran.err
 
 
 def test_an_option_that_the_command_never_had_has_no_new_name(topology: str, cli: Cli) -> None:
@@ -104,7 +114,7 @@ def test_a_former_key_names_the_present_one(old: str, topology: str, cli: Cli) -
         words = ["library", "Pad", "--folder", "parts"]
     ran = cli(*words)
     assert ran.code == 1 and ran.err.count("E2") == 1
-    assert f"has no key {old}: it is named {RENAMED[old]} now. Write: {RENAMED[old]}" in ran.err
+    assert f"; its present name is {RENAMED[old]}. Try: {RENAMED[old]}" in ran.err
 
 
 def test_no_former_name_is_a_present_one() -> None:

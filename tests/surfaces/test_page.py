@@ -25,8 +25,8 @@ import pytest
 
 import apc
 from apc.compiler.compiled import Model
-from apc.frame.overrides import parse_override
-from apc.frame.parameter_names import ParameterRef
+from apc.parameter_values.overrides import parse_override
+from apc.parameter_values.parameter_names import ParameterRef
 from tests.commands import Cli, write
 from tests.surfaces.pages import CHROMIUM, MODEL, VERDICT, Tab, launched, served
 from tests.topologies import AVERAGE, TOPOLOGIES
@@ -36,6 +36,7 @@ pytest.importorskip("bokeh")
 from bokeh.document import Document
 
 from apc.app import sections
+from apc.app.figures import MotionFigure, RegionFigure, RootsFigure, TransparencyFigure
 from apc.app.motion import motion_of
 from apc.app.page import TopologyTab, topology_of
 from apc.app.sections import SectionAnswer, Task, compute
@@ -50,10 +51,10 @@ from apc.app.sliders import (
     sliders_of,
     with_value,
 )
-from apc.app.worker_process import Desk
+from apc.app.worker_process import SectionWorker
 from apc.app.yaml_edit import with_values
-from apc.processes import Workers, model_bytes
 from apc.simulation.initial_velocity import SPEED
+from apc.support.processes import Workers, model_bytes
 
 NOTHING = "topology: none\npeers: {user: {count: 1}}\nmasses: {}\n"
 LOSSY = AVERAGE.replace("delay: 8 ms}", "delay: 8 ms, loss: 10 %, jitter: 1 ms}")
@@ -179,7 +180,7 @@ def test_what_goes_wrong_in_a_section_is_told_there(tmp_path: Path, monkeypatch:
 
     monkeypatch.setitem(sections.SECTIONS, "transparency", broken)
     told = compute(model_bytes(compiled(AVERAGE, tmp_path)), Task("transparency", ()))
-    assert told.why == "This is a bug of apc, not of your topology: ValueError: shapes differ"
+    assert told.why == "Internal error of apc: ValueError: shapes differ"
 
 
 # Who computes it.
@@ -207,18 +208,18 @@ def at_once(call: Callable[[], None], seconds: float) -> None:
 
 def test_an_old_answer_never_takes_the_place_of_a_newer_one() -> None:
     held, shown = Held(), []
-    desk = Desk(b"", ("a", "b"), at_once, lambda section, told: shown.append((section, told.result)))
+    desk = SectionWorker(b"", ("a", "b"), at_once, lambda section, told: shown.append((section, told.result)))
     desk.workers = Workers(held.submit, 1, lambda _: None)
-    assert desk.ask(Task("b", (), 1)) and not desk.ask(Task("b", (), 1))
+    assert desk.submit(Task("b", (), 1)) and not desk.submit(Task("b", (), 1))
     for number in (2, 3, 4):  # while it computes, the newest waits in the place of those before it
-        desk.ask(Task("b", (), number))
-    desk.ask(Task("a", (), 5))
+        desk.submit(Task("b", (), number))
+    desk.submit(Task("a", (), 5))
     held.finish(0)
     held.finish(1)
     held.finish(2)
     assert shown == [("b", {"of": 1}), ("a", {"of": 5}), ("b", {"of": 4})]
-    desk.ask(Task("b", (), 6))
-    desk.forget("b")
+    desk.submit(Task("b", (), 6))
+    desk.cancel("b")
     held.finish(3)
     assert len(shown) == 3
 
@@ -261,10 +262,10 @@ def test_what_can_t_be_explored_is_told_before_a_page_is_served(
         used.bind(("127.0.0.1", 0))
         used.listen()
         port = used.getsockname()[1]
-        message = f"--port: E982 port {port} is taken. Write: --port 0  (any that is free)\n"
-        assert cli(f"explore topology.yaml --no-browser --port {port}") == (1, "", message)
+        message = f"--port: E982 port {port} is taken. Try: --port 0\n"
+        assert cli(f"explore topology.yaml --no-browser --port {port}") == (1, "", "starting ...\n" + message)
     monkeypatch.setitem(sys.modules, "bokeh.server.server", None)
-    message = "E875 bokeh.server.server is not installed. Write: pip install '.[explore]'"
+    message = "E875 bokeh.server.server is not installed. Try: pip install '.[explore]'"
     assert message in cli("explore topology.yaml").err
 
 
@@ -351,7 +352,7 @@ def test_whoever_sees_no_pictures_and_has_no_mouse_finds_everything_by_name(tab:
     names = [one.get_attribute("aria-label") for one in tab.page.get_by_role("slider").all()]
     assert None not in names and {"lan.delay", "user.count", "time"} <= set(names)
     headings = [one.inner_text() for one in tab.page.get_by_role("heading").all()]
-    assert {"Verdict", "Stable region", "Eigenvalues", "Response", "What the hand feels"} <= set(headings)
+    assert {"Verdict", "Stable region", "Eigenvalues", "Response", "Impedance"} <= set(headings)
     for width in (1280, 800):
         tab.page.set_viewport_size({"width": width, "height": 900})
         tab.page.wait_for_timeout(500)
@@ -365,7 +366,7 @@ def test_a_topology_without_two_axes_is_shown_without_a_region(browser: Any, tmp
     with served(tmp_path / "none.yaml") as link:
         tab = Tab(browser, f"{link}&x-axis=user.count")
         tab.page.wait_for_function(f"{MODEL}('region-words').text.includes('this topology has fewer')")
-        assert "user.count can be no axis" in tab.page.evaluate(f"{MODEL}('message').text")
+        assert "user.count cannot be an axis" in tab.page.evaluate(f"{MODEL}('message').text")
         assert tab.page.get_by_role("combobox", name="Region: horizontal axis").count() == 0
         assert tab.press("user.count", "ArrowRight", 1) == "2"
         tab.page.wait_for_function("location.search.includes('user.count=2')")
@@ -461,34 +462,79 @@ def test_connections_that_ask_for_nothing_keep_nobody_out(left: int) -> None:
 
 
 class Asked:
-    """What stands in the place of a `Desk`: it keeps what it is asked."""
+    """What stands in the place of a `SectionWorker`: it keeps what it is asked."""
 
     requested: ClassVar[list[Task]] = []
 
     def __init__(self, model: bytes, order: Sequence[str], *_: object) -> None:
         self.order, self.busy = order, None
 
-    def ask(self, task: Task) -> bool:
+    def submit(self, task: Task) -> bool:
         self.requested.append(task)
         return True
 
-    def forget(self, section: str) -> None:
+    def cancel(self, section: str) -> None:
         pass
 
-    def put_before(self, other: Asked) -> None:
+    def precede(self, other: Asked) -> None:
         pass
+
+
+def test_figures_are_hidden_until_their_result_is_there() -> None:
+    for figure in (RegionFigure(), RootsFigure(), TransparencyFigure()):
+        assert not figure.plot.visible and "Computing" in figure.words.model.text
+    motion = MotionFigure()
+    assert not any(one.visible for one in (motion.plot, motion.stage, motion.time, motion.simulation))
+
+
+def test_peaks_of_an_impedance_are_resolved_and_inside_the_axes(tmp_path: Path) -> None:
+    system = compiled(AVERAGE, tmp_path)
+    told = compute(model_bytes(system), Task("transparency", (), "")).result
+    assert told is not None
+    dense = np.abs(apc.transparency(system, np.geomspace(0.1, 60, 1500)).impedance)
+    assert told["magnitude"].max() > 0.99 * dense.max()
+    figure = TransparencyFigure()
+    figure.show(told)
+    low, high = figure.plot.y_range.start, figure.plot.y_range.end
+    decades = np.log10(high / low)
+    assert np.log10(high / dense.max()) > 0.05 * decades < np.log10(dense.min() / low) + 1e-2 * decades
+
+
+def test_a_named_parameter_has_a_range_by_its_margin_within_the_limits_of_what_depends_on_it(
+    tmp_path: Path,
+) -> None:
+    text = AVERAGE.replace("clocks:", "parameters: {k: 100 N/m}\nclocks:", 1).partition("studies:")[0]
+    system = compiled(text.replace("stiffness: 500 N/m", "stiffness: k"), tmp_path)
+    slider = named(sliders_of(system), "k")
+    limit = apc.critical(system, "k").value
+    assert slider.span is not None and limit is not None
+    assert slider.span[0] == 0 == slider.values[0] and limit < slider.span[1] < 3 * limit
+
+
+def test_an_unreliable_topology_opens_with_mean_square_stability(tmp_path: Path) -> None:
+    opened = tab_of(compiled(LOSSY, tmp_path))
+    assert opened.criterion_select.value.startswith("mean-square")
+    verdict = next(task for task in Asked.requested if task.section == "verdict")
+    told = compute(model_bytes(opened.system), verdict).result
+    assert told is not None and told["measure"] == "growth factor of mean squares"
+    assert tab_of(compiled(AVERAGE, tmp_path)).criterion_select.value.startswith("nominal")
+
+
+def tab_of(system: Model) -> TopologyTab:
+    """Return the page of a tab without a browser, and without those who compute for it."""
+    document, request = Document(), SimpleNamespace(arguments={})
+    context = SimpleNamespace(request=request)
+    document._session_context = lambda: context  # type: ignore[assignment]
+    Asked.requested.clear()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("apc.app.page.SectionWorker", Asked)
+        return TopologyTab(topology_of(system, (), None), document)
 
 
 @pytest.fixture(scope="module")
 def page(tmp_path_factory: pytest.TempPathFactory) -> TopologyTab:
-    """Give the page of a tab without a browser, and without those who compute for it."""
-    document, request = Document(), SimpleNamespace(arguments={})
-    context = SimpleNamespace(request=request)
-    document._session_context = lambda: context  # type: ignore[assignment]
-    topology = compiled(LOSSY, tmp_path_factory.mktemp("page"))
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("apc.app.page.Desk", Asked)
-        found = TopologyTab(topology_of(topology, (), None), document)
+    """Give the page of a tab that several tests use."""
+    found = tab_of(compiled(LOSSY, tmp_path_factory.mktemp("page")))
     found._deliver("verdict", SectionAnswer(None, "none"))
     names = ["user[1].device.x", "user[1].cube.x"]
     used = {"names": names, "at": names[0], "notes": ()} | {one: np.ones(2) for one in TRANSPARENCY}
@@ -525,7 +571,7 @@ def tapped(page: TopologyTab, x: Any, y: Any) -> None:
 
 @pytest.mark.whole
 def test_what_the_browser_can_t_say_changes_nothing(page: TopologyTab) -> None:
-    models = [*page.handles, *page.selects, page.begins, page.meant, page.at]
+    models = [*page.handles, *page.selects, page.start_select, page.criterion_select, page.device_select]
     before = [one.value for one in models]
     for value in WRONG:
         for model in models:
@@ -554,25 +600,26 @@ def test_what_the_browser_may_say_is_computed(page: TopologyTab) -> None:
     for model, value in (
         (page.handles[0], last),
         (page.selects[0], "device.mass"),
-        (page.meant, "packets as they are lost and late (takes long)"),
-        (page.begins, "as the topology begins"),
-        (page.at, "user[1].cube.x"),
+        (page.criterion_select, "nominal (every packet on time)"),
+        (page.start_select, "initial state of the topology"),
+        (page.device_select, "user[1].cube.x"),
     ):
         says(page, model, value)
     assert page.positions[0] == last
     assert page.sliders[page.chosen[0]].label == "device.mass"
-    assert page.meant.value.startswith("packets")
+    assert page.criterion_select.value.startswith("nominal")
     assert next(one for one in reversed(Asked.requested) if one.section == "motion").request is False
     assert Asked.requested[-1].request == "user[1].cube.x"
     says(page, page.handles[0], last + 1)
-    assert "contact.stiffness can&#x27;t be" in page.message.model.text
+    assert "contact.stiffness: " in page.message.model.text
     says(page, page.selects[0], "contact.stiffness")
     tapped(page, 1500, 300)
     moved = {one.label: one.values[at] for one, at in zip(page.sliders, page.positions, strict=True)}
     assert moved["contact.stiffness"] == 1500 and moved["coordination.stiffness"] == 300
-    page._ask_tune()
+    page._start_tuning()
     free, best = Asked.requested[-1].request
-    assert best == "coordination.stiffness" and free[0] == "contact.stiffness=0.0 N/m:5000.0 N/m"
+    assert best == "contact.stiffness" and page.tune.label == "Maximize contact.stiffness"
+    assert free[0] == "contact.stiffness=0.0 N/m:5000.0 N/m"
 
 
 UPGRADE = {

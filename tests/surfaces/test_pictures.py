@@ -10,17 +10,18 @@ from pathlib import Path
 
 import matplotlib.colors
 import matplotlib.figure
+import matplotlib.text
 import numpy as np
 import pytest
 
 import apc
 from apc.output import animation
 from apc.output.analysis_output import analysis_picture
-from apc.output.pictures import colours_of, write_figure
+from apc.output.pictures import colours_of, legend_below, write_figure
 from apc.output.region_picture import panels_picture
 from apc.regions.panels import compare_regions
 from tests.commands import Cli, folder
-from tests.topologies import AVERAGE, TOPOLOGIES, compiled, replaced
+from tests.topologies import AVERAGE, MESH, TOPOLOGIES, compiled, replaced
 
 TOPOLOGY = str(TOPOLOGIES / "three-users-average.yaml")
 X, Y = "contact.stiffness=0 N/m:3000 N/m", "coordination.stiffness=0 N/m:3000 N/m"
@@ -45,6 +46,80 @@ def test_eight_topologies_have_eight_lines_and_one_that_is_another_says_so() -> 
     assert ax.get_title().count("identical") == 1
 
 
+def _notes_of(figure: matplotlib.figure.Figure) -> str:
+    return " ".join(text.get_text() for text in figure.findobj(matplotlib.text.Text) if text.get_gid())
+
+
+def test_notes_on_regions_are_below_the_figure_once_and_optional() -> None:
+    system = compiled((TOPOLOGIES / "lossy-average.yaml").read_text(encoding="utf-8"))
+    panels = compare_regions(
+        [system], x=X, y=Y, panels=(("cube.mass=0.6 kg",), ("cube.mass=1 kg",)), cells=4, criterion="nominal"
+    )
+    figure = panels.plot()
+    note = panels.panels[0].regions[0].limitations[0]
+    assert " ".join(_notes_of(figure).split()).lower().count(note.lower()) == 1
+    assert not any(note in " ".join(ax.get_title().split()) for ax in figure.axes)
+    assert _notes_of(panels.plot(notes=False)) == ""
+
+
+@pytest.mark.parametrize(
+    ("topology", "axis", "label", "ticks"),
+    [
+        (
+            "three-users-average",
+            "coordination.stiffness=0 N/m:1e5 N/m",
+            "coordination.stiffness [kN/m]",
+            (0, 100),
+        ),
+        ("three-users-average", "cube.mass=0.01 kg:0.05 kg", "cube.mass [g]", (10, 50)),
+        ("lossy-average", "lan.loss=0:0.5", "lan.loss [%]", (0, 50)),
+    ],
+)
+def test_axes_have_units_with_numbers_of_a_readable_size(
+    topology: str, axis: str, label: str, ticks: tuple[float, float]
+) -> None:
+    system = compiled((TOPOLOGIES / f"{topology}.yaml").read_text(encoding="utf-8"))
+    y = "contact.stiffness=50 N/m:100 N/m" if topology == "lossy-average" else X  # stable everywhere
+    [found] = compare_regions([system], x=axis, y=y, cells=4).panels[0].regions
+    ax = found.plot()
+    ax.figure.draw_without_rendering()
+    printed = [float(text.get_text()) for text in ax.get_xticklabels()]
+    assert ax.get_xlabel() == label and (printed[0], printed[-1]) == ticks
+    assert all(0.1 <= abs(number) <= 1e4 for number in printed if number)
+    assert ax.xaxis.get_offset_text().get_text() == ""
+    assert ax.get_xlim() == (float(found.x.low), float(found.x.high))  # data in SI
+    assert topology == "lossy-average" or found.curves
+    share = 100 * found.stable_area / float(found.rectangle.width.prod())
+    if found.curves:
+        assert f"stable: {share:.3g} % of the rectangle" in ax.get_title()
+
+
+def test_a_comparison_has_no_empty_panel_and_no_line_through_a_number() -> None:
+    compared = apc.compare([compiled(AVERAGE), compiled(MESH)])
+    figure = compared.plot()
+    shown = [ax for ax in figure.axes if ax.axison]
+    assert all(any(patch.get_width() > 0 for patch in ax.patches) for ax in shown)
+    assert "No panel for largest stable loss" in _notes_of(figure)
+    radius = next(ax for ax in shown if ax.get_title() == "spectral radius per frame")
+    figure.draw_without_rendering()
+    [line] = [line for line in radius.lines if list(line.get_xdata()) == [1, 1]]
+    across = line.get_window_extent().x0
+    boxes = [text.get_window_extent() for text in radius.texts if text.get_text()]
+    assert len(boxes) >= 2 and not any(box.x0 <= across <= box.x1 for box in boxes)
+
+
+def test_a_legend_has_at_most_six_entries_and_the_number_of_the_others() -> None:
+    ax = matplotlib.figure.Figure().subplots()
+    for number in range(12):
+        ax.plot([0, 1], [0, number], label=f"curve {number}")
+    legend_below(ax)
+    texts = [text.get_text() for text in ax.get_legend().get_texts()]
+    assert texts == [*(f"curve {number}" for number in range(6)), "... and 6 more"]
+    run = apc.simulate(TOPOLOGIES / "ring-of-eight.yaml", duration="4 ms", jit=False)
+    for ax in run.plot().axes:
+        assert len(ax.get_legend().get_texts()) <= 7
+
+
 @pytest.mark.parametrize("count", [1, 10, 11, 31, 100])
 def test_as_many_colours_as_are_asked_for(count: int) -> None:
     assert len(set(colours_of(count))) == count
@@ -60,7 +135,7 @@ def test_the_eigenvalues_drawn_are_those_of_the_analysis_within_the_circle() -> 
         assert np.abs(drawn @ [1, 1j] - value).min() < 1e-12
     (low, high), (bottom, top) = ax.get_xlim(), ax.get_ylim()
     assert low < -1 < 1 < high and bottom < -1 < 1 < top
-    assert "settles within 2 % in" in " ".join(ax.get_title().split())
+    assert "settling time (2 %)" in " ".join(ax.get_title().split())
 
 
 def test_text_in_an_svg_is_text(tmp_path: Path) -> None:
@@ -97,7 +172,7 @@ def test_a_root_locus_passes_the_circle_where_stability_changes() -> None:
     axes = critical.plot(size=(4, 3), labels={"real part": "Re"})
     assert axes.get_xlabel() == "Re" and tuple(axes.figure.get_size_inches()) == (4, 3)
     texts = [one.get_text() for one in axes.get_legend().get_texts()]
-    assert texts == ["now, 500 N/m", "changes at 1096.41 N/m, 20.29 Hz"]
+    assert texts == ["present value, 500 N/m", "stability limit 1096.41 N/m, 20.29 Hz"]
     points = np.asarray(axes.collections[0].get_offsets()) @ [1, 1j]
     assert np.abs(points).max() > 1.01
     for value in (500, 1096):
@@ -132,7 +207,7 @@ def test_without_ffmpeg_it_says_what_to_do(cli: Cli, monkeypatch: pytest.MonkeyP
     writers = pytest.importorskip("matplotlib.animation").writers
     monkeypatch.setattr(type(writers), "is_available", lambda self, name: False)
     ran = cli(f"simulate '{TOPOLOGIES}/planar-users.yaml' --out run.mp4")
-    message = "E875 ffmpeg is not installed, which writes .mp4. Write: --out run.gif, or install ffmpeg"
+    message = "E875 ffmpeg is not installed, which writes .mp4. Try: --out run.gif, or apt install ffmpeg"
     assert ran.code == 1 and message in ran.err
     assert folder() == []
 
@@ -140,7 +215,7 @@ def test_without_ffmpeg_it_says_what_to_do(cli: Cli, monkeypatch: pytest.MonkeyP
 @pytest.mark.whole
 @pytest.mark.parametrize("words", [f"analyze '{TOPOLOGY}'", f"critical coordination.stiffness '{TOPOLOGY}'"])
 def test_pictures_beside_answers_are_refused_before_anything_is_computed(words: str, cli: Cli) -> None:
-    assert "E878 the suffix of --plot" in cli(f"{words} --plot a.txt").err
+    assert "E878 suffix of --plot" in cli(f"{words} --plot a.txt").err
     assert "E930" in cli(f"{words} --hands passive --plot a.svg").err
     assert "a.svg is written" in cli(f"{words} --plot a.svg").out
 

@@ -24,12 +24,12 @@ import pytest
 from apc.__main__ import run
 from apc.compiler.errors import ApcError, Diagnostic
 from apc.output.realtime_output import ticks_text
-from apc.processes import Workers
 from apc.realtime.device import device_function
 from apc.realtime.peer_run import run_of
 from apc.realtime.run_comparison import Ticks
 from apc.realtime.run_folder import read_run
 from apc.realtime.start import LocalRun, RunPart, run_all
+from apc.support.processes import Workers
 from tests.surfaces.wire import Other, Wire, loop_at, send_packets
 from tests.topologies import AVERAGE, compiled, replaced
 
@@ -70,8 +70,8 @@ def test_all_peers_of_a_topology_do_what_is_simulated_with_the_packets_they_hear
     assert [one.name for one in read_run(Path("three.run")).peers] == ["user[1]", "user[2]"]
     assert run(["compare", "three.run"]) == 0
     out = capsys.readouterr().out
-    assert "packets were held back and lost at the sender" in out
-    assert "signals differ by at most\n" in out
+    assert "delay and loss of the links were emulated at the sender" in out
+    assert "unit  max difference  max value\n" in out
     Path("three.run/user-1.npz").write_bytes(b"PK")
     assert run(["compare", "three.run"]) == 1
     assert "E973" in capsys.readouterr().err
@@ -119,8 +119,8 @@ def test_a_device_may_be_in_c(tmp_path: Path) -> None:
     ("fault", "message"),
     [
         ("raise OSError('gone')", "raised OSError at 0.05 s: gone"),
-        ("return None", "gave None as its position at 0.05 s"),
-        ("return '1'", "gave '1' as its position at 0.05 s"),
+        ("return None", "returned None as position at 0.05 s"),
+        ("return '1'", "returned '1' as position at 0.05 s"),
     ],
 )
 def test_a_device_that_fails_ends_the_loop_and_what_was_done_is_kept(
@@ -177,7 +177,7 @@ def test_what_cant_be_played_is_told(
     alone = replaced(MOVING, ("{count: 3,", "{count: 65,"))
     Path("many.yaml").write_text(alone, encoding="utf-8")
     assert run(["run", "many.yaml", "--duration", "1 s"]) == 1
-    assert "E975 65 peers would be as many processes: at most 64" in capsys.readouterr().err
+    assert "E975 65 peers need as many processes; the limit is 64." in capsys.readouterr().err
     used.close()
 
 
@@ -209,8 +209,8 @@ def test_a_peer_that_is_lost_or_silent_takes_nothing_of_the_others_along(
     parts = run_all(compiled(MOVING), LocalRun(Fraction(1), b"", emulate=False, seed=None, patience=1.0))
     assert [one.run for one in parts if one.run] == [whole]
     assert [str(one.trouble) for one in parts if one.trouble] == [
-        "user[2]: E975 ended without a word: what it played is lost.",
-        "user[3]: E975 did not end within 0 s of being told to, and was ended: what it played is lost.",
+        "user[2]: E975 peer process exited unexpectedly; its recording is lost.",
+        "user[3]: E975 did not exit within 0 s and was terminated; its recording is lost.",
     ]
 
 
@@ -258,8 +258,11 @@ def test_ctrl_c_ends_a_peer_and_what_it_did_is_kept(tmp_path: Path) -> None:
 def test_each_heading_is_above_its_column() -> None:
     ticks = Ticks("left[1]", 2000, (1e-5, 2e-5, 3e-5, 4e-5), (1e-4, 2e-4, 3e-4, 4e-4), 0.0, False, (), {})
     lines = list(ticks_text([ticks]))
-    for subject, heading, row in (("late by", *lines[:2]), ("took", *lines[2:4])):
-        assert heading.split()[: len(subject.split())] == subject.split()
+    for title, (subject, heading, row) in (
+        ("Delay of ticks", (lines[1], *lines[3:5])),
+        ("Computing time of ticks", (lines[6], *lines[8:10])),
+    ):
+        assert subject == title and heading.split()[0] == "peer"
         assert row.split()[:2] == ["left[1]", "2,000"]
-        assert heading.index("instants") + len("instants") == row.index("2,000") + len("2,000")
+        assert heading.index("ticks") + len("ticks") == row.index("2,000") + len("2,000")
         assert len(heading) == len(row)  # the numbers end where their headings do

@@ -22,6 +22,7 @@ from apc.output.report_output import read_page, report_page
 from apc.reports.contents import Report, differences
 from apc.reports.shown_lines import line_differences
 from tests.commands import Cli, folder, write
+from tests.surfaces.pages import CHROMIUM, launched
 from tests.topologies import AVERAGE, TOPOLOGIES, replaced
 
 TOPOLOGY = TOPOLOGIES / "three-users-average.yaml"
@@ -87,7 +88,7 @@ def test_every_section_is_there_with_its_picture_text_and_command() -> None:
         [section] = re.findall(rf'<section id="{key}">.*?</section>', page(), re.DOTALL)
         assert f"<h2>{title.replace('&', '&amp;')}</h2>" in section
         if key == "network":
-            assert "no packet can get lost" in section
+            assert "no link has a loss" in section
             continue
         assert "<pre>" in section and "Produced by <code>apc " in section
         assert ("data:image/svg" in section) == (key != "compiled")
@@ -141,11 +142,11 @@ def test_sections_that_a_topology_cannot_fill_say_why(cli: Cli) -> None:
     why = {one.key: one.refused for one in report.topologies[0].sections if one.refused}
     assert (
         why["region"]
-        == "all peers share fewer than two stiffnesses, and the topology says no studies: region:"
+        == "fewer than two stiffnesses are common to all peers, and the topology has no studies: region:"
     )
     assert why["network"] == "loss: there is no link"
     text = html.unescape(report_page(report))
-    assert all(f"Not here: {reason}" in text for reason in why.values())
+    assert all(f"Not available: {reason}" in text for reason in why.values())
 
 
 @pytest.mark.whole
@@ -167,7 +168,7 @@ def test_a_report_is_computed_anew_from_itself_alone(cli: Cli) -> None:
     assert cli("report topology.yaml --set 'device.damping=2 N*s/m' --out r.html").code == 0
     for name in ("topology.yaml", "users.csv"):
         Path(name).unlink()
-    assert "r.html: every number is the same, computed anew" in cli("report --check r.html").out
+    assert "r.html: all numbers reproduced" in cli("report --check r.html").out
     assert folder() == ["r.html"]
     text = Path("r.html").read_text(encoding="utf-8")
     stored = read_page(Path("r.html")).stored
@@ -177,7 +178,7 @@ def test_a_report_is_computed_anew_from_itself_alone(cli: Cli) -> None:
     write("r.html", text.replace(f"{old!r},", f"{old + 0.001!r},").replace(version, '"apc": "0.0.1"'))
     ran = cli("report --check r.html")
     assert ran.code == 1
-    assert f"note: apc was 0.0.1, and is {apc.__version__} here" in ran.err
+    assert f"note: apc: 0.0.1 in the report, {apc.__version__} here" in ran.err
     assert f"E991 Verdict, modes and margins: [1].spectral_radius is {old:.12g}, not" in ran.err
 
 
@@ -235,7 +236,7 @@ def test_what_a_page_shows_is_what_is_checked(cli: Cli) -> None:
         write("r.html", page)
         ran = cli("report --check r.html")
         assert ran.code == 1, what
-        assert re.search(r"^r\.html:\d+:1: E991 shows ", ran.err, re.MULTILINE), (what, ran.err)
+        assert re.search(r"^r\.html:\d+:1: E991 line: expected ", ran.err, re.MULTILINE), (what, ran.err)
         assert "every number" not in ran.out
     write("r.html", text)
     assert cli("report --check r.html").code == 0
@@ -315,12 +316,12 @@ def test_a_report_from_somebody_writes_nowhere_else(name: str, cli: Cli) -> None
 @pytest.mark.parametrize(
     ("words", "code", "message"),
     [
-        (f"'{TOPOLOGY}' --out r.txt", 1, "E878 the suffix of --out"),
+        (f"'{TOPOLOGY}' --out r.txt", 1, "E878 suffix of --out"),
         (f"'{TOPOLOGY}' --out no/r.html", 1, "E601"),
         (
             f"'{TOPOLOGY}' --out r.pdf",
             1,
-            "E875 Chromium is not installed, which prints a .pdf. Write: --out r.html",
+            "E875 Chromium is not installed, which prints a .pdf. Try: --out r.html",
         ),
         (f"'{TOPOLOGY}'", 2, "--out"),
         ("topology.apc --out r.html", 1, "E615"),
@@ -396,7 +397,7 @@ def test_a_digest_that_is_not_that_of_its_text_is_found(cli: Cli) -> None:
     digest = dict(read_page(Path("r.html")).stored["topologies"][0]["origin"])["topology.yaml"]
     write("r.html", text.replace(digest, "0" * 64))
     ran = cli("report --check r.html")
-    assert ran.code == 1 and "the SHA-256 of topology.yaml is not that of its text" in ran.err
+    assert ran.code == 1 and "SHA-256 of topology.yaml does not match its text" in ran.err
 
 
 @pytest.mark.whole
@@ -409,4 +410,21 @@ def test_several_topologies_are_checked_side_by_side(cli: Cli) -> None:
     compared = text.index('<section id="compared">')
     write("r.html", text[:compared] + text[compared:].replace("lone", "alone", 1))
     ran = cli("report --check r.html")
-    assert ran.code == 1 and "E991 shows" in ran.err
+    assert ran.code == 1 and "E991 line: expected" in ran.err
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium")
+def test_code_of_a_report_fits_a_window_of_1200_pixels(tmp_path: Path) -> None:
+    pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    line = '<pre>{}</pre><div class="topologies"><div><pre>{}</pre></div><div><pre>{}</pre></div></div>'
+    wide = page().partition("<main>")[0] + "<main>" + line.format(*["x" * 79 + " " + "word " * 60] * 3)
+    with launched() as browser:
+        for text in (page(), wide + "</main></body></html>"):
+            (tmp_path / "r.html").write_text(text, encoding="utf-8")
+            tab = browser.new_page(viewport={"width": 1200, "height": 900})
+            tab.goto((tmp_path / "r.html").as_uri())
+            scrolled = (
+                "[...document.querySelectorAll('pre')].filter(p => p.scrollWidth > p.clientWidth).length"
+            )
+            assert tab.evaluate(scrolled) == 0
+            assert tab.evaluate("document.documentElement.scrollWidth") <= 1200

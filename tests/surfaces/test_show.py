@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import json
 import re
 import xml.etree.ElementTree as ET
 from pathlib import Path
@@ -83,9 +84,9 @@ def test_no_text_of_a_picture_stands_over_another_or_leaves_the_page(name: str, 
 def test_the_picture_names_every_part_with_its_type_and_numbers() -> None:
     words = words_of(apc.show(FILE, format="svg"))
     for word in (
-        *("three-users-average, one of 3 peers", "device", "mass 0.1 kg", "cube", "shared: 0.2 kg a copy"),
+        *("three-users-average, one of 3 peers", "device", "mass 0.1 kg", "cube", "shared: 0.2 kg per copy"),
         *("contact", "SampledSpringDamper", "stiffness 1000 N/m", "delay 1 ms", "coordination"),
-        *("AveragePosition", "lan", "available 8 ms later", "lan: 3 peers, complete graph"),
+        *("AveragePosition", "lan", "delay 8 ms", "lan: 3 peers, complete graph"),
         *("haptic: every 1 ms", "ms of one frame, 8 ms"),
     ):
         assert word in words, word
@@ -119,28 +120,41 @@ def test_parts_are_joined_as_the_topology_says(tmp_path: Path) -> None:
     ):
         assert frozenset(pair) in many, pair
     words = " ".join(words_of(shown(MANY, "svg", tmp_path)))
-    assert "40 of them" in words and "only at left" in words
+    assert "array of 40" in words and "only at left" in words
 
 
 def test_the_text_tells_graph_equations_and_schedule() -> None:
     lines = apc.show(FILE).splitlines()
     for line in (
         "  device: mass 0.1 kg, damping 5 N·s/m",
-        "    joined to device, cube",
-        "    joined to cube, lan",
-        "  kind user: 18 equations, 18 unknowns",
-        "    device.mass*der(device.v) = device.flange.f - device.damping*device.v #",
-        "      der(device.v) := (device.flange.f - device.damping*device.v)/device.mass",
-        "  frame of 8 ms, after which every clock stands as before",
-        "  clock network, period 8 ms, ticks 1, sends lan",
-        "  kind user, hold contact.f, clock haptic, delay 1 ms, held 1 ms",
+        "    connected to device, cube",
+        "    connected to cube, lan",
+        "Equations of peer type user: 18 equations, 18 unknowns",
+        "    device.mass*der(device.v) = device.flange.f - device.damping*device.v",
+        "  frame 8 ms (least common multiple of the clock periods)",
+        "  clock network, period 8 ms, ticks per frame 1, sends lan",
+        "  peer type user, hold contact.f, clock haptic, delay 1 ms, held 1 ms",
     ):
         assert line in lines, line
-    schedule = " ".join(" ".join(lines[lines.index("SCHEDULE") :]).split())
+    schedule = " ".join(" ".join(lines[lines.index("Schedule") :]).split())
     assert (
-        "link lan, sends coordination.x and coordination.v, period 8 ms, delay 8 ms, on the way 1, "
-        "age 8 ms to 16 ms"
+        "link lan, sends coordination.x and coordination.v, period 8 ms, delay 8 ms, "
+        "packets in transit 1, data age 8 ms to 16 ms"
     ) in schedule
+
+
+@pytest.mark.parametrize("name", ["three-users-average", "teleoperation-pair", "unlike-devices"])
+def test_each_equation_of_a_part_is_printed_once(name: str) -> None:
+    path = TOPOLOGIES / f"{name}.yaml"
+    lines = apc.show(path).splitlines()
+    text = "".join("".join(lines[: lines.index("Schedule")]).split())
+    peer_types = json.loads(apc.show(path, format="json"))["kinds"]
+    different = {tuple(item["equation"] for item in kind["equations"]): kind for kind in peer_types}
+    for equations, kind in different.items():
+        for equation in {*equations}:
+            printed = text.count("".join(equation.split()))
+            assert printed == sum(equation in each for each in different), (kind["name"], equation)
+    assert "#" not in text and ":=" not in text
 
 
 @pytest.mark.few(3)
@@ -173,8 +187,8 @@ def test_what_costs_a_pair_is_said(cli: Cli) -> None:
     ran = cli("compile topology.yaml")
     assert ran.code == 0, ran.err
     assert re.search(
-        r"costs N²: sum\(.*others\.coordination\.x.*\) is evaluated once a pair of peers, as what it "
-        "runs over is not linear in what the others send over lan",
+        r"sum\(.*others\.coordination\.x.*\) is evaluated for each pair of peers, as its argument is not "
+        "linear in the values received over lan",
         " ".join(ran.out.split()),
     )
 
@@ -216,13 +230,13 @@ KINDS = ".txt, .json, .dot, .gv, .mmd, .svg, .png, .pdf"
 @pytest.mark.parametrize(
     ("words", "name", "requested"),
     [
-        ((), "topology.jpg", f"one of {KINDS}, got .jpg. Write: --out topology.txt"),
-        (("--format", "dot"), "topology.svg", "one of .dot, .gv, got .svg. Write: --out topology.dot"),
+        ((), "topology.jpg", f"one of {KINDS}, got .jpg. Try: --out topology.txt"),
+        (("--format", "dot"), "topology.svg", "one of .dot, .gv, got .svg. Try: --out topology.dot"),
     ],
 )
 def test_no_file_is_written_as_what_its_name_does_not_say(
     words: tuple[str, ...], name: str, requested: str, cli: Cli
 ) -> None:
-    message = f"{name}: E878 the suffix of --out wants {requested}\n"
+    message = f"{name}: E878 suffix of --out: expected {requested}\n"
     assert cli("show", str(FILE), *words, "--out", name) == Ran(1, "", message)
     assert folder() == []

@@ -27,7 +27,7 @@ def test_the_only_topology_of_a_folder_is_played_for_as_long_as_it_says(cli: Cli
     ran = cli("simulate")
     assert (ran.code, ran.err) == (0, "")
     assert ran.out.startswith("experiment-average: decays\n")
-    assert "3001 rows of 18 signals until 3 s" in ran.out
+    assert "3001 samples of 18 signals until 3 s" in ran.out
 
 
 def test_rows_and_picture_are_written_and_named(moved: Cli) -> None:
@@ -53,14 +53,14 @@ def test_json_is_one_document_with_what_made_it(moved: Cli) -> None:
 @pytest.mark.parametrize(
     ("words", "printed"),
     [
-        ("", "topology.yaml: E877 the topology says no duration."),
-        ("--duration 3", '--duration: E204 duration wants s, got 3 (no unit). Write: --duration "3 s"'),
-        ("--duration 1s --out run.doc", "run.doc: E878 the suffix of --out wants one of .csv,"),
-        ("--out p.png", "wants one of .csv, .parquet, .mat, .npz, .gif, .mp4, got .png. Write: --plot p.png"),
-        ("--duration 1s --snapshot run.doc", "run.doc: E878 the suffix of --snapshot wants one of"),
-        ("--duration 1s --plot run.doc", "run.doc: E878 the suffix of --plot wants one of .png,"),
+        ("", "topology.yaml: E877 the topology has no duration."),
+        ("--duration 3", '--duration: E204 duration: expected s, got 3 (no unit). Try: --duration "3 s"'),
+        ("--duration 1s --out run.doc", "run.doc: E878 suffix of --out: expected one of .csv,"),
+        ("--out p.png", "one of .csv, .parquet, .mat, .npz, .gif, .mp4, got .png. Try: --plot p.png"),
+        ("--duration 1s --snapshot run.doc", "run.doc: E878 suffix of --snapshot: expected one of"),
+        ("--duration 1s --plot run.doc", "run.doc: E878 suffix of --plot: expected one of .png,"),
         ("--duration 1s --out no/run.csv", "no/run.csv: E601 can't be written: No such file"),
-        ("--duration 1s --method euler:1ms", "--method: E910 the method wants one of exact,"),
+        ("--duration 1s --method euler:1ms", "--method: E910 method: expected one of exact,"),
     ],
 )
 def test_what_is_wrong_is_told_in_one_line(words: str, printed: str, moved: Cli) -> None:
@@ -77,7 +77,7 @@ def test_a_topology_at_rest_is_said_to_rest_and_an_unstable_one_is_an_answer(cli
         "",
         "  No position changes.",
         "",
-        "  recorded       1001 rows of 24 signals until 1 s",
+        "  recorded            1001 samples of 24 signals until 1 s",
     ]
     write("topology.yaml", replaced(MOVED, ("stiffness: 500 N/m", "stiffness: 50 kN/m")))
     ran = cli("simulate --duration 10s --out run.csv")
@@ -98,16 +98,16 @@ def test_ctrl_c_keeps_what_is_done(moved: Cli, monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(output_blocks, "forces_in_time", interrupted)
     ran = moved("simulate --duration 1s --out run.csv")
     assert ran.code == 130 and "run.csv is written" in ran.out
-    assert ran.err.startswith("stopped at 0.079 s of 1 s; what was done is kept")
+    assert ran.err.startswith("stopped at 0.079 s of 1 s; completed rows are stored")
     assert len(Path("run.csv").read_text(encoding="utf-8").splitlines()) == 81
 
 
 @pytest.mark.whole
 def test_the_error_and_the_method_are_told_if_asked_for(moved: Cli) -> None:
     exact = moved("simulate --duration 0.1s --error").out
-    assert "  error          none but rounding; about " in exact and "method" not in exact
+    assert "  error               rounding only, about " in exact and "method" not in exact
     out = moved("simulate --duration 0.1s --error --method semi-implicit:1/2ms").out
-    assert "  method         semi-implicit:0.5 ms\n" in out
+    assert "  method              semi-implicit:0.5 ms\n" in out
     assert "(half the step, semi-implicit:0.25 ms)" in " ".join(out.split())
     assert all(len(line) <= 80 for line in out.splitlines())
     told = json.loads(moved("simulate --duration 0.1s --error --method rk4:1ms --json").out)

@@ -13,7 +13,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from apc.tables import BLOCK, TableColumn, blocks_of, check_table_path, keep_room, read_table, write_table
+from apc.support.tables import (
+    BLOCK,
+    TableColumn,
+    blocks_of,
+    check_table_path,
+    keep_room,
+    read_table,
+    write_table,
+)
 from tests.topologies import told
 
 COLUMNS = (TableColumn("x", "m"), TableColumn("verdict", kind="text"), TableColumn("modes", kind="count"))
@@ -72,7 +80,7 @@ def test_a_missing_pyarrow_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(importlib, "import_module", missing)
     assert told(check_table_path, Path("t.parquet"), "--out") == [
         "t.parquet: E887 is a Parquet file, which needs pyarrow; without it, the name can end in .csv. "
-        "Write: pip install '.[data]'  # in the folder of apc's own pyproject.toml"
+        "Try: pip install '.[data]'  # in the folder of apc's own pyproject.toml"
     ]
     assert told(check_table_path, Path("t.csv"), "--out") == []
 

@@ -12,9 +12,9 @@ import apc
 from apc.app.yaml_edit import with_values, write_topology
 from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError
-from apc.frame.overrides import apply, parse_override
-from apc.frame.parameter_listing import parameters
-from apc.frame.parameter_names import find
+from apc.parameter_values.overrides import apply, parse_override
+from apc.parameter_values.parameter_listing import parameters
+from apc.parameter_values.parameter_names import find
 from tests.commands import Cli, write
 from tests.topologies import TOPOLOGIES
 
@@ -190,7 +190,7 @@ def test_a_text_that_would_be_another_topology_is_refused_and_not_written(tmp_pa
     path.write_text(text, encoding="utf-8")
     out.write_text("mine", encoding="utf-8")
     system = apc.compile(path)
-    with pytest.raises(ApcError, match=r"E702 device\.mass is given by set and by the table"):
+    with pytest.raises(ApcError, match=r"E702 device\.mass is given both by set and by the table"):
         write_topology(out, text, system, {find(system, "device.mass"): "0.3 kg"})
     (tmp_path / "else").mkdir()
     with pytest.raises(ApcError, match=r"users\.csv"):  # which is not beside what is written

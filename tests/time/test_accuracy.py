@@ -34,7 +34,7 @@ def test_an_exact_topology_is_off_by_roundings_and_the_estimate_is_no_less() -> 
     made = np.abs(found.values[:, :2] - followed[1]).max(axis=0)
     told = np.array([one.error for one in found.error.signals[:2]])
     assert (made <= told).all() and (told <= 100 * made).all()
-    assert error_text(found.error).startswith("none but rounding; about ")
+    assert error_text(found.error).startswith("rounding only, about ")
 
 
 @pytest.mark.few(3)

@@ -12,10 +12,10 @@ from scipy.spatial.transform import Rotation
 
 import apc
 from apc.compiler.compiled import Model
-from apc.output.object_shapes import heading
+from apc.output.object_shapes import heading, views_of
 from apc.output.pictures import write_picture
 from apc.output.simulation_output import paths_of
-from apc.output.still_picture import draw_actors
+from apc.output.still_picture import _bar, draw_actors
 from tests.topologies import AVERAGE, TOPOLOGIES, compiled, library, replaced
 
 pytest.importorskip("matplotlib")
@@ -30,7 +30,7 @@ def test_every_peer_has_a_row_and_the_rest_is_counted(tmp_path: Path) -> None:
     assert [one.get_text() for one in drawn.get_yticklabels()] == ["right[1]", "left[1]", "left[2]"]
     assert len(drawn.patches) == 3
     many = draw_actors(compiled(replaced(AVERAGE, ("count: 3", "count: 1000"))))[0]
-    assert many.get_suptitle() == "three-users-average: at the start (988 more peers)"
+    assert many.get_suptitle() == "three-users-average: initial state (988 more peers not drawn)"
     write_picture(lambda: draw_actors(topology("experiment-average"))[0], tmp_path / "still.svg")
     assert (tmp_path / "still.svg").read_text(encoding="utf-8").startswith("<?xml")
 
@@ -70,6 +70,28 @@ def test_every_peer_has_a_plane_of_its_own_to_one_scale(tmp_path: Path) -> None:
     assert low < -62 < 23 < high
 
 
+def test_a_held_body_reaches_to_its_grasp_point_and_a_line_joins_it_to_the_device() -> None:
+    """The beam is held at 0.3 m from its middle, at the left end by one user, at the right by the other."""
+    system = topology("carried-beam")
+    arms = [view.contacts for view in views_of(system)]
+    assert [[(one.holder, one.held) for one in contacts] for contacts in arms] == [[("device", "beam")]] * 2
+    assert np.allclose([contacts[0].arm for contacts in arms], [(-0.3, 0), (0.3, 0)], rtol=0, atol=1e-9)
+    _, _, lines = draw_actors(system)
+    for line, place in zip(lines, (-300, 300), strict=True):
+        assert np.allclose(line.line.get_xydata(), [(place, 0)] * 2, rtol=0, atol=1e-6)
+        line.held.move([10.0, 20.0], math.pi / 2)
+        line.draw()
+        assert np.allclose(line.line.get_xydata(), [(place, 0), (10, 20 + place)], rtol=0, atol=1e-6)
+        box = line.held.artists[-1]
+        assert box.get_width() == pytest.approx(600)
+    turned = replaced(
+        (TOPOLOGIES / "carried-beam.yaml").read_text(encoding="utf-8").partition("\n")[2],
+        ("beam:   {type: PlanarBody,", "beam:   {type: PlanarBody, angle: 0.7 rad,"),
+    )
+    arms = [view.contacts for view in views_of(compiled(turned))]
+    assert np.allclose([contacts[0].arm for contacts in arms], [(-0.3, 0), (0.3, 0)], rtol=0, atol=1e-9)
+
+
 def test_what_turns_has_a_bar_along_its_axis_and_what_does_not_none() -> None:
     device, beam = sorted(draw_actors(topology("carried-beam"))[1][:2], key=lambda one: one.turning)
     assert (device.turning, beam.turning, len(device.artists)) == ((), ("left[1].beam.angle",), 1)
@@ -77,8 +99,7 @@ def test_what_turns_has_a_bar_along_its_axis_and_what_does_not_none() -> None:
     size = np.linalg.norm(vectors, axis=1, keepdims=True)
     x, y, _ = Rotation.from_rotvec(vectors).apply([1, 0, 0]).T
     assert heading(2 * vectors / size * np.tan(size / 2)) == pytest.approx(np.arctan2(y, x))
-    beam.move([0.0, 0.0], math.pi / 3)
-    mark = MarkerStyle(beam.artists[-1].get_marker())
+    mark = MarkerStyle(_bar(math.pi / 3))
     ends = mark.get_transform().transform(mark.get_path().vertices)
     assert {round(math.degrees(math.atan2(y, x))) for x, y in ends if x or y} == {60, -120}
 

@@ -13,7 +13,7 @@ import pytest
 
 from apc.compiler.compiled import Model
 from apc.compiler.pipeline import compile_topology
-from apc.frame.overrides import apply, parse_override
+from apc.parameter_values.overrides import apply, parse_override
 from apc.simulation.c_compiler import compiler
 from apc.simulation.output_blocks import blocks
 from apc.simulation.settings import Settings

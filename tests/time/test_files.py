@@ -91,7 +91,7 @@ def test_a_file_holds_every_digit_of_every_row(simulation: Simulation, tmp_path:
 def test_what_cannot_be_written_is_refused_before_anything_runs(
     simulation: Simulation, tmp_path: Path
 ) -> None:
-    requested = r"E878 the suffix of --out wants one of .*, got \.xls\. Write: --out .*run\.csv"
+    requested = r"E878 suffix of --out: expected one of .*, got \.xls\. Try: --out .*run\.csv"
     for name, printed in (("run.xls", requested), ("nowhere/run.csv", "E879 can't be written: No such file")):
         with pytest.raises(ApcError, match=printed):
             open_recording(tmp_path / name, simulation)

@@ -209,7 +209,7 @@ def test_peers_are_pushed_for_long_each_by_its_own_force_one_of_them_by_none(tmp
 
 def test_a_force_that_changes_without_end_is_refused(tmp_path: Path) -> None:
     system = pushed("type: SineForce, force: 1 N, frequency: 1e9 Hz", tmp_path)
-    with pytest.raises(ApcError, match=r"E871 a force changes too fast: .* more than 100 places"):
+    with pytest.raises(ApcError, match=r"E871 a force changes too fast: .* more than 100 points"):
         simulate(system, duration=Fraction(1, 10), jit=False)
 
 

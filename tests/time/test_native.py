@@ -49,7 +49,7 @@ def test_a_linker_opens_nothing_of_the_working_folder(
     cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(module, "PATIENCE", 5.0)
+    monkeypatch.setattr(module, "TIMEOUT", 5.0)
     for name in ("libgcc_s.so.1", "libm.so.6", "libc.so.6"):
         os.mkfifo(name)  # who opens it waits for ever
     assert half(native(TEXT)) == 1.5

@@ -231,7 +231,9 @@ def test_a_lost_packet_is_missed_by_its_pair_alone(tmp_path: Path, name: str, mo
 
 
 def test_nobody_has_no_maximum(tmp_path: Path) -> None:
-    with pytest.raises(ApcError, match=r"E801 far\[2\] hears nobody over lan: there is no max over nobody"):
+    with pytest.raises(
+        ApcError, match=r"E801 far\[2\] has no incoming connection over lan, so max\(\) is undefined"
+    ):
         topology(tmp_path, "max", "delay: 8 ms, graph: {arcs: [[1, 2], [2, 1], [1, 3]]}")
 
 

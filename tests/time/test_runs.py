@@ -35,7 +35,9 @@ def test_the_average_decays_and_the_mesh_oscillates() -> None:
     turns = np.count_nonzero(np.diff(np.sign(np.diff(tail))))
     assert crests.frequency == pytest.approx(turns / 2 / 0.6, abs=crests.error + 1)
     assert crests.size == pytest.approx(np.ptp(tail), rel=0.1) and crests.size > 1e-3
-    assert str(AVERAGE_RUN).startswith("experiment-average: decays\n\n  The motion decays.")
+    assert str(AVERAGE_RUN).startswith(
+        "experiment-average: decays\n\n  Every position converges to a constant value."
+    )
 
 
 def settling_time(found: Trajectory) -> float:
@@ -254,8 +256,8 @@ def test_the_public_function_plays_a_file_with_other_numbers(tmp_path: Path) -> 
 # ---- what is asked, and what is refused ----
 
 
-KINDS = "E910 the method wants one of exact, rk4, semi-implicit, cvodes,"
-RANGE = "E912 the relative tolerance of cvodes wants a number from 1e-12 to 0.01,"
+KINDS = "E910 method: expected one of exact, rk4, semi-implicit, cvodes,"
+RANGE = "E912 relative tolerance of cvodes: expected a number from 1e-12 to 0.01,"
 
 
 @pytest.mark.parametrize(
@@ -266,14 +268,14 @@ RANGE = "E912 the relative tolerance of cvodes wants a number from 1e-12 to 0.01
         ("rk4:250us", Method("rk4", step=MS / 4)),
         (" semi-implicit : 1 ms", Method("semi-implicit", step=MS)),
         ("cvodes:1e-8", Method("cvodes", tolerance=1e-8)),
-        ("rk5:1 ms", f"{KINDS} got rk5:1 ms. Write: rk4:0.1ms"),
-        ("", f"{KINDS} got nothing. Write: exact"),
-        ("exact:1 ms", "E910 the method wants exact alone, which has no step, got exact:1 ms. Write: exact"),
-        ("rk4", "E911 rk4 wants a step, got none. Write: rk4:0.1ms"),
-        ("rk4:0 ms", "E911 the step of rk4 wants more than 0 s, got 0 ms. Write: rk4:0.1ms"),
-        ("rk4:0.1", "E204 the step of rk4 wants s, got 0.1 (no unit). Write: rk4:0.1ms"),
-        ("cvodes:7", f"{RANGE} got 7. Write: cvodes:1e-10"),
-        ("cvodes:nan", f"{RANGE} got nan. Write: cvodes:1e-10"),
+        ("rk5:1 ms", f"{KINDS} got rk5:1 ms. Try: rk4:0.1ms"),
+        ("", f"{KINDS} got nothing. Try: exact"),
+        ("exact:1 ms", "E910 method: expected exact without a step, got exact:1 ms. Try: exact"),
+        ("rk4", "E911 rk4: expected a step, got none. Try: rk4:0.1ms"),
+        ("rk4:0 ms", "E911 step of rk4: expected more than 0 s, got 0 ms. Try: rk4:0.1ms"),
+        ("rk4:0.1", "E204 step of rk4: expected s, got 0.1 (no unit). Try: rk4:0.1ms"),
+        ("cvodes:7", f"{RANGE} got 7. Try: cvodes:1e-10"),
+        ("cvodes:nan", f"{RANGE} got nan. Try: cvodes:1e-10"),
     ],
 )
 def test_a_method_is_read_with_its_step_exact_or_refused_in_one_line(text: str, meant: Method | str) -> None:
@@ -286,11 +288,11 @@ def test_a_method_is_read_with_its_step_exact_or_refused_in_one_line(text: str, 
 def test_a_step_that_the_topology_has_no_room_for_is_refused() -> None:
     system = compiled(AVERAGE)
     assert told(check_step, system, Method("rk4", step=2 * MS), MS, MS) == [
-        "topology.yaml: E913 the step of rk4 wants at most the period of the fastest clock, 1 ms, "
-        "got 2 ms. Write: --method rk4:1ms"
+        "topology.yaml: E913 step of rk4: expected at most the period of the fastest clock, 1 ms, "
+        "got 2 ms. Try: --method rk4:1ms"
     ]
     [printed] = told(check_step, system, Method("rk4", step=MS / 10**7), MS, MS)
-    assert printed.startswith("topology.yaml: E913 the step of rk4 wants at least 1e-06 ms,")
+    assert printed.startswith("topology.yaml: E913 step of rk4: expected at least 1e-06 ms,")
     for method in (Method("rk4", step=MS), DEFAULT):
         check_step(system, method, MS, MS)
 
@@ -298,18 +300,18 @@ def test_a_step_that_the_topology_has_no_room_for_is_refused() -> None:
 def test_a_run_is_as_long_as_is_said_and_no_longer_than_anyone_waits() -> None:
     system = compiled(AVERAGE)
     assert told(simulate, system) == [
-        "topology.yaml: E877 the topology says no duration. Write: experiment: {duration: 3 s}  "
-        '(or --duration "3 s")'
+        "topology.yaml: E877 the topology has no duration. Try: experiment: {duration: 3 s}, "
+        'or --duration "3 s"'
     ]
-    with pytest.raises(ApcError, match=r"E877 the duration wants more than 0 s, got -1 s"):
+    with pytest.raises(ApcError, match=r"E877 duration: expected more than 0 s, got -1 s"):
         simulate(system, duration=Fraction(-1))
     longest = MOST_ROWS * MS  # a row a tick
     check_length(system, longest)
     check_length(system, longest / 10, runs=10)
-    requested = r'E915 the duration wants at most 1e\+06 s: .* Write: --duration "1e\+06 s"'
+    requested = r'E915 duration: expected at most 1e\+06 s .* Try: --duration "1e\+06 s"'
     with pytest.raises(ApcError, match=requested):
         check_length(system, longest + 1)
-    with pytest.raises(ApcError, match=r"at most 100000 s in each of 10 runs: .*got 200000 s"):
+    with pytest.raises(ApcError, match=r"at most 100000 s in each of 10 runs .*got 200000 s"):
         check_length(system, longest / 5, runs=10)
     long, short = (prepare(system, Settings(Fraction(one), jit=False)) for one in (10_000, 1))
     assert size_note(short, decimal=True) == ""
@@ -325,11 +327,11 @@ def test_what_cant_be_simulated_is_refused_by_name(monkeypatch: pytest.MonkeyPat
     ).partition("studies:")[0]
     with pytest.raises(ApcError, match=r"E870 the motion of device\.v, cube\.v is not linear .* contact:"):
         simulate(compiled(crossley), duration=Fraction(1), method=Method("exact"))
-    with pytest.raises(ApcError, match=r"E873 no signal fits 'cub\.x'; .* Write: --signals cube\.x"):
+    with pytest.raises(ApcError, match=r"E873 no signal matches 'cub\.x'; .* Try: --signals cube\.x"):
         simulate(compiled(AVERAGE), duration=Fraction(1), signals=["cub.x"])
     with pytest.raises(ApcError, match="E874"):
         simulate(compiled(replaced(AVERAGE, ("count: 3", "count: 1000000000"))), duration=Fraction(1))
-    monkeypatch.setattr("apc.memory.free_memory", lambda: 8e9)
+    monkeypatch.setattr("apc.support.memory.free_memory", lambda: 8e9)
     with pytest.raises(ApcError, match="E874 10,000 peers"):
         prepare(edged("sum", [0.0] * 10_000), Settings(Fraction(1)))
 

@@ -1,4 +1,4 @@
-"""The same sweep on a real Dask cluster: the same numbers, and a sentence when the cluster isn't there."""
+"""The same sweep on a real Dask cluster: equal results, and a sentence when the cluster isn't there."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from typing import Any
 
 import pytest
 
-from apc import processes
 from apc.compiler.errors import ApcError
-from apc.processes import Patience
-from apc.sweeps import cluster as sweep_cluster
-from apc.sweeps import work as sweep_work
-from apc.sweeps.resumable_sweep import sweep
+from apc.studies import cluster as sweep_cluster
+from apc.studies import work as sweep_work
+from apc.studies.resumable_sweep import sweep
+from apc.support import processes
+from apc.support.processes import Patience
 from tests.sweeping import CHEAP, parts
 from tests.topologies import compiled, told
 
@@ -52,7 +52,7 @@ def test_what_was_begun_by_one_process_is_finished_on_a_cluster_to_the_last_bit(
 
     with pytest.raises(KeyboardInterrupt):
         sweep(MODEL, OVER, out=target, jobs=1, progress=stop)
-    assert sweep(MODEL, OVER, out=target, cluster=address).notes == ("128 points were there already",)
+    assert sweep(MODEL, OVER, out=target, cluster=address).notes == ("128 points were computed before",)
     assert target.read_bytes() == whole.read_bytes()
     assert len(list(tmp_path.iterdir())) == 2
 
@@ -62,27 +62,27 @@ def test_workers_with_other_versions_are_refused(
     tmp_path: Path, address: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     other = tuple((name, "1.2.3" if name == "numpy" else v) for name, v in sweep_work.program_versions())
-    monkeypatch.setattr("apc.sweeps.resumable_sweep.program_versions", lambda: other)
-    with pytest.raises(ApcError, match=r"E888 a worker has numpy .* \(here 1\.2\.3\): the same numbers"):
+    monkeypatch.setattr("apc.studies.resumable_sweep.program_versions", lambda: other)
+    with pytest.raises(ApcError, match=r"E888 a worker has numpy .* \(here 1\.2\.3\): equal results"):
         sweep(MODEL, OVER, out=tmp_path / "r.csv", cluster=address)
     assert list(tmp_path.iterdir()) == []
 
 
-FORM = ". Write: --cluster tcp://HOST:8786"
+FORM = ". Try: --cluster tcp://HOST:8786"
 
 
 @pytest.mark.parametrize(
     ("where", "message"),
     [
         *(
-            (where, f"{where}: E888 a scheduler's address wants HOST:PORT, got {where}{FORM}")
+            (where, f"{where}: E888 scheduler's address: expected HOST:PORT, got {where}{FORM}")
             for where in ("tcp://", "tcp://host", "host without port", "a:b:c", "x" * 80)
         ),
-        ("", f": E888 a scheduler's address wants HOST:PORT{FORM}"),
-        ("nonsense://host:1", "nonsense://host:1: E888 no Dask scheduler answers there"),
+        ("", f": E888 scheduler's address: expected HOST:PORT{FORM}"),
+        ("nonsense://host:1", "nonsense://host:1: E888 no answer of a Dask scheduler within"),
         (
             "tls://127.0.0.1:8786",
-            "tls://127.0.0.1:8786: E888 Dask has no certificate for it (distributed.comm.tls in its own",
+            "tls://127.0.0.1:8786: E888 Dask has no certificate for this address (distributed.comm.tls in",
         ),
     ],
 )
@@ -101,7 +101,7 @@ def test_a_cluster_that_is_not_there_is_told_soon(tmp_path: Path, monkeypatch: p
         used.bind(("127.0.0.1", 0))
         where = f"tcp://127.0.0.1:{used.getsockname()[1]}"
         assert told(lambda: sweep(MODEL, OVER, out=tmp_path / "r.csv", cluster=where)) == [
-            f"{where}: E888 no Dask scheduler answers there within 0.5 s{FORM}"
+            f"{where}: E888 no answer of a Dask scheduler within 0.5 s{FORM}"
         ]
     assert list(tmp_path.iterdir()) == []
 
@@ -109,8 +109,8 @@ def test_a_cluster_that_is_not_there_is_told_soon(tmp_path: Path, monkeypatch: p
 def test_a_missing_distributed_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     assert told(lambda: sweep(MODEL, OVER, cluster="tcp://host:1")) == [
-        "tcp://host:1: E888 a cluster needs Dask's distributed, here and on its workers. "
-        "Write: pip install '.[cluster]'  # in the folder of apc's own pyproject.toml"
+        "tcp://host:1: E888 a cluster requires Dask's distributed on this computer and on the workers. "
+        "Try: pip install '.[cluster]'  # in the folder of apc's own pyproject.toml"
     ]
 
 
@@ -122,7 +122,7 @@ def test_a_cluster_without_workers_is_told(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setattr(distributed.Client, "wait_for_workers", none_comes)
     with distributed.LocalCluster(n_workers=0, **ANYWHERE) as empty:
         assert told(lambda: sweep(MODEL, OVER, cluster=empty.scheduler_address)) == [
-            f"{empty.scheduler_address}: E888 the cluster there has no workers."
+            f"{empty.scheduler_address}: E888 the cluster has no workers."
         ]
 
 
@@ -164,9 +164,6 @@ def test_a_frozen_worker_is_waited_for_aloud_and_only_so_long(monkeypatch: pytes
             (message,) = told(lambda: sweep(MODEL, OVER, cluster=frozen.scheduler_address, patience=waiting))
         finally:
             os.kill(worker, signal.SIGCONT)
-    waited = "no result from the processes that compute for {} s; still waiting"
+    waited = "no result from the worker processes for {} s; still waiting"
     assert received == [waited.format(s) for s in (0.1, 0.2)]
-    assert message == (
-        "sweep: E889 no result from the processes that compute for 0.3 s: they are stuck, or a part takes "
-        'longer. Write: --patience "0.6 s"'
-    )
+    assert message == ('sweep: E889 no result from the worker processes for 0.3 s. Try: --patience "0.6 s"')

@@ -13,8 +13,8 @@ import pytest
 
 import apc
 from apc.__main__ import run
-from apc.comparison.comparison import Scheme, SchemeComparison
 from apc.compiler.errors import ApcError
+from apc.studies.comparison import Scheme, SchemeComparison
 from tests.topologies import AVERAGE, MESH, ONE_MASS, TOPOLOGIES, compiled, replaced
 
 LOSSLESS = replaced(AVERAGE, ("delay: 8 ms}", "delay: 8 ms, loss: 0 %}"))
@@ -95,11 +95,12 @@ def test_a_scheme_that_is_not_linear_is_judged_in_time_beside_its_linearization(
     played = apc.simulate(system)
     assert one.simulated is not None and one.simulated.to_dict() == played.to_dict()
     words = str(found).splitlines()
-    place = words.index("     in time                            played")
+    place = words.index("Simulation") + 2
+    assert words[place].split() == ["verdict", "duration"]
     settled = f"decays, settling time {played.summary.settled:.3g} s"
     assert words[place + 1 : place + 3] == [
-        f"  1  {settled:<33}  3 s",
-        "  2  as its verdict says: it is linear",
+        f"  1  {settled:<36}  3 s",
+        "  2  not required: the topology is linear",
     ]
     column = found.to_dataframe()["in time"]
     assert column[0] == "decays" and column.isna()[1]
@@ -109,8 +110,8 @@ def test_a_scheme_that_is_not_linear_is_judged_in_time_beside_its_linearization(
 @pytest.mark.parametrize(
     ("experiment", "message"),
     [
-        ("", "apc simulate: the topology says no duration."),  # what to write is for that command
-        ("experiment: {duration: 1e12 s}\n", "apc simulate: the duration wants at most 1e+06 s"),
+        ("", "apc simulate: the topology has no duration."),  # what to write is for that command
+        ("experiment: {duration: 1e12 s}\n", "apc simulate: duration: expected at most 1e+06 s"),
     ],
 )
 def test_what_is_not_played_says_why(experiment: str, message: str) -> None:
@@ -131,7 +132,7 @@ def test_a_scheme_that_refuses_has_its_place_and_says_why(tmp_path: Path) -> Non
     one, other = json.loads(out.read_text(encoding="utf-8"))["schemes"]
     assert one["analysis"] is not None and not one["refused"]
     assert (other["analysis"], other["stiffness"], other["transparency"], other["stable"]) == (None,) * 4
-    assert (other["verdict"], other["refused"]) == ("refused", "--hands held: user has a hand already, arm.")
+    assert (other["verdict"], other["refused"]) == ("refused", "--hands held: user already has the hand arm.")
 
 
 @pytest.mark.whole
@@ -219,19 +220,19 @@ def test_the_stiffness_is_of_the_coupler_that_hears_others_or_of_what_it_follows
         (
             [TWO_SPRINGS],
             [],
-            "topology.yaml: E941 has 2 numbers that could be compared as its stiffness: "
+            "topology.yaml: E941 has 2 parameters that could be compared as stiffness: "
             "coordination.stiffness, "
-            "leash.stiffness. Write: --over coordination.stiffness",
+            "leash.stiffness. Try: --over coordination.stiffness",
         ),
         (
             [AVERAGE],
             ["leash.stifness"],
-            "--over: E622 leash.stifness is no parameter of three-users-average. ",
+            "--over: E622 leash.stifness is not a parameter of three-users-average. ",
         ),
         (
             [AVERAGE, MESH],
             ["cube.mass"],
-            "--over: E940 cube.mass of three-users-average wants a stiffness, a delay or a loss, got ",
+            "--over: E940 cube.mass of three-users-average: expected a stiffness, a delay or a loss, got ",
         ),
     ],
 )
@@ -255,26 +256,26 @@ def test_a_cell_that_cant_be_had_says_why_below_its_dash() -> None:
         ["delay"],
         ["delay", "loss", "stiffness", "transparency"],
     ]
-    assert missing[0]["loss"] == "no packet can get lost; loss: 0 % written to lan lets its loss be varied"
+    assert missing[0]["loss"] == "no link has a loss; write loss: 0 % at lan to vary it"
     assert missing[1]["delay"].startswith("apc critical lan.delay: lan.delay can't be varied in mean square")
     text = " ".join(str(found).split())
     assert all(" ".join(why.split()) in text for one in missing for why in one.values())
 
 
 @pytest.mark.whole
-def test_schemes_that_differ_in_more_than_their_coupling_are_told_of_and_what_is_left_out_first() -> None:
+def test_notes_name_differences_other_than_the_coupling_and_limitations() -> None:
     longer = replaced(AVERAGE, ("network: 8 ms", "network: 10 ms"), ("count: 3", "count: 4"))
     assert compared(AVERAGE, MESH).notes == ()
     found = compared(AVERAGE, longer, LOSSY)
     assert found.notes == (
-        "they have different numbers of peers: 3, 4",
-        "their frames differ, and with them what a spectral radius is of: 8 ms, 10 ms",
-        "some are judged in mean square over the network as it is, some with every packet on time",
+        "the numbers of peers differ: 3, 4",
+        "the frames differ, so spectral radii are per different times: 8 ms, 10 ms",
+        "some verdicts are mean-square, others are for the nominal network",
     )
     assert found.limitations == (
-        "3: left out: packet loss (10 %) of lan; here every packet takes the nominal 8 ms",
+        "3: excluded: packet loss (10 %) of lan; every packet has the nominal delay of 8 ms",
     )
-    assert str(found).splitlines()[1].startswith("  of a link that is, or becomes, unreliable: ")
+    assert "\n  Criterion for unreliable links: " in str(found)
 
 
 # ---- the command ----

@@ -48,32 +48,37 @@ def test_so_it_is_with_groups_and_with_counts_that_follow_from_numbers() -> None
 @pytest.mark.parametrize(
     ("text", "setting", "message"),
     [
-        (AVERAGE, "user.count=2.5", "E626 user.count wants a whole number from 1 to 1,000,000,000, got 2.5."),
+        (
+            AVERAGE,
+            "user.count=2.5",
+            "E626 user.count: expected a whole number from 1 to 1,000,000,000, got 2.5.",
+        ),
         (
             AVERAGE,
             "user.count=1",
-            "E626 the number of all peers wants at least 2: parts follow the others, got 1.",
+            "E626 total number of peers: expected at least 2, as a part receives from the other peers, "
+            "got 1.",
         ),
         (
             replaced(AVERAGE, ("{count: 3}", "{set: {device.mass: [0.1 kg, 0.2 kg]}}")),
             "user.count=3",
-            "E626 device.mass has one value for each of the 2 peers of user: their count follows from them.",
+            "E626 device.mass has one value for each of the 2 peers of user; the count can't be changed.",
         ),
         (
             replaced(AVERAGE, ("delay: 8 ms}", f"delay: 8 ms, graph: {EDGES}}}")),
             "user.count=4",
-            "E626 the graph of lan names its peers: user.count is what it is in the topology.",
+            "E626 the graph of lan lists peers by number; user.count can't be changed.",
         ),
         (
             RING,
             "user.count=1000001",
-            "E626 user.count wants at most 1,000,000 peers where lan isn't complete, got 1,000,001.",
+            "E626 user.count: expected at most 1,000,000 peers where lan isn't complete, got 1,000,001.",
         ),
         (
             NAMED,
             "user.n=4",
-            "E622 user.count is one number of the topology, and depends on what is set for user. "
-            "Write: the same without the group, or a group with a set of its own",
+            "E622 user.count is a number of the topology, but depends on a value of user. "
+            "Set it without the group, or set a separate value in the group.",
         ),
     ],
 )
@@ -87,11 +92,11 @@ def test_a_count_that_cannot_be_is_refused(text: str, setting: str, message: str
 @pytest.mark.parametrize(
     ("count", "message"),
     [
-        ("count: kt", " count wants 1, got kt, which is in N/m. Write: count: 1"),
-        ("count: m", "count wants a whole number, or an expression over numbers of parameters, got m."),
-        ("count: n/2", "count wants a whole number from 1 to 1000000000, got n/2, which is 1.5"),
-        ("count: peers", "peers depends on peers, which it is a part of. Write: count: 3"),
-        ("count: twice", "twice depends on peers, which it is a part of. Write: count: 3"),
+        ("count: kt", " count: expected 1, got kt, which is in N/m. Try: count: 1"),
+        ("count: m", "count: expected a whole number, or an expression in dimensionless parameters, got m."),
+        ("count: n/2", "count: expected a whole number from 1 to 1000000000, got n/2, which is 1.5"),
+        ("count: peers", "count peers depends on peers, the sum of all counts. Try: count: 3"),
+        ("count: twice", "count twice depends on peers, the sum of all counts. Try: count: 3"),
     ],
 )
 def test_a_count_by_names_is_read_with_care(count: str, message: str) -> None:

@@ -18,11 +18,15 @@ import apc
 from apc.__main__ import run
 from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError
-from apc.eigen.ball_arithmetic import precision
-from apc.parameter_studies.critical_values import Critical
-from apc.parameter_studies.crossing import ESTIMATE, SingleSegment, SmoothSegment, Verdict, search
-from apc.parameter_studies.margins import Margin
-from apc.parameter_studies.parameter_path import pointwise
+from apc.lifting.numeric_model import numeric_model
+from apc.parameter_values.overrides import Override, apply
+from apc.parameter_values.parameter_names import find
+from apc.spectrum.ball_arithmetic import precision
+from apc.studies.critical_values import Critical
+from apc.studies.crossing import ESTIMATE, SingleSegment, SmoothSegment, Verdict, search
+from apc.studies.evaluator_choice import EvaluatorKind, evaluator_for
+from apc.studies.margins import Margin
+from apc.studies.parameter_path import pointwise
 from apc.verdict import NO_PROOF
 from tests.bench import random_scans
 from tests.bruteforce import TopologySource, as_ball, frame_matrices, frame_matrix
@@ -192,7 +196,7 @@ def test_what_a_number_reaches_by_other_ways_has_its_known_value(
     (one,) = found.crossings
     assert one.value == pytest.approx(value, abs=off) and found.has_effect
     if name != "kt":
-        assert "the topology is not linear" in str(found)
+        assert "nonlinear topology" in str(found)
 
 
 def test_the_error_holds_against_the_full_map_in_50_digits() -> None:
@@ -284,7 +288,7 @@ def test_the_verdict_along_a_scan_is_what_analyses_say(name: str) -> None:
 
 def test_how_many_users_is_answered_as_each_topology_alone_would() -> None:
     found = apc.critical(compiled(MESH), "user.count", lower="2", upper="40")
-    assert {str(one.proof) for one in found.crossings} == {"both judged"}
+    assert {str(one.proof) for one in found.crossings} == {"both analyzed"}
     ends = [int(one.boundary) for one in found.crossings]
     alone = [apc.analyze(compiled(MESH), params={"user.count": str(count)}).stable for count in range(2, 41)]
     expected = [alone[0] is (sum(end < count for end in ends) % 2 == 0) for count in range(2, 41)]
@@ -331,7 +335,7 @@ def test_a_link_delay_jumps_where_a_packet_comes_a_tick_later() -> None:
     assert apc.analyze(moved).stable and apc.critical(moved, "lan.delay").value == first.value
     assert first.stable_at is True
     assert f"stable with lan.delay up to {1000 * first.value:g} ms\n" in str(found)
-    assert "jump, stable at it, stable below it" in str(found)
+    assert "below (jump, inclusive)" in str(found)
     row = next(one for one in apc.margins(moved).rows if one.parameter == "lan.delay")
     assert (row.value, row.gain_margin, row.kind) == (first.value, 1.0, "jump")
 
@@ -372,7 +376,7 @@ def test_stretches_of_which_no_analysis_decides_are_said_to_be_left_open() -> No
     """Every eigenvalue of those who move together is on the circle, exactly, as soon as packets are late."""
     found = apc.critical(followers(2, 1000.0), "lan.delay", upper="3 ms")
     assert not found.complete and found.undecided[-1] == (0.002, 0.003)
-    assert "the verdict is left open from" in " ".join(str(found).split())
+    assert "undecided: " in " ".join(str(found).split())
     assert found.to_dict()["undecided"] == [list(one) for one in found.undecided]
 
 
@@ -398,25 +402,25 @@ def test_no_crossing_is_an_answer_in_words() -> None:
         None,
         (0.0, 900.0),
     )
-    assert str(found.verdict) == "stable at every value scanned" and found.has_effect
+    assert str(found.verdict) == "stable at every evaluated value" and found.has_effect
     above = apc.critical(compiled(AVERAGE), STIFFNESS, lower="1200 N/m", upper="2000 N/m")
-    assert str(above.verdict) == "unstable at every value scanned"
-    # A wave impedance of 0 divides by zero: the least value looked at is above it.
+    assert str(above.verdict) == "unstable at every evaluated value"
+    # A wave impedance of 0: the least value looked at is above it.
     waves = apc.set_parameters(topology("two-users-waves"), {"lan.delay": "72 ms"})
     found = apc.critical(waves, "coordination.impedance", upper="1 N*s/m")
-    assert str(found.verdict) == "stable at every value scanned" and found.searched_to[0] > 0
+    assert str(found.verdict) == "stable at every evaluated value" and found.searched_to[0] > 0
     idle = apc.critical(compiled(AVERAGE), "cube.x")
     assert not idle.has_effect and idle.value is None
     printed = " ".join(str(idle).split())
-    assert "stable whatever its value: nothing that decides stability depends on it" in printed
+    assert "stable at every value: the parameter does not affect stability" in printed
     apart = apc.set_parameters(wall(0.1, 1.0, 0.0, 100.0), {"device.x": "-1 mm", "it.x": "-1 mm"})
     printed = " ".join(str(apc.critical(apart, "it.stiffness")).split())
-    assert "where the topology starts: there nothing depends on this number" in printed
+    assert "at the initial state, where this parameter has no effect" in printed
 
 
 def test_a_delay_where_what_is_heard_at_the_start_decides_is_refused() -> None:
     text = replaced(MESH, ("type: FullMesh", "type: SaturatedMesh, limit: 3 N"))
-    with pytest.raises(ApcError, match="E845 how the topology moves hangs on what is heard at the start"):
+    with pytest.raises(ApcError, match="E845 the linearization depends on the initial packets"):
         apc.critical(compiled(text), "contact.delay")
 
 
@@ -426,26 +430,26 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "topology.yaml").write_text(AVERAGE, encoding="utf-8")
 
 
-ORDER = "apc critical: E841 the command wants a parameter or delay, then the topology, got "
+ORDER = "apc critical: E841 arguments: expected PATH, then FILE, got "
 
 
 @pytest.mark.parametrize(
     ("words", "message"),
     [
         ("haptic.phase", "E844 haptic.phase sets the phase of a clock"),
-        ("user.contact.delay", "contact.delay is one time for all groups. Write: contact.delay"),
-        ("", "E622 an empty name is no parameter of"),
-        ("contact.stiffness|--upper|900", "--upper: E204 contact.stiffness wants N/m, got 900 (no"),
-        ("contact.stiffness|--upper|900", 'Write: --upper "900 N/m"'),
-        ("contact.stiffness|--lower|9 N/m|--upper|3 N/m", "E842 the range of contact.stiffness wants"),
-        ("contact.stiffness|--lower|-5 N/m", "E843 a limit of contact.stiffness wants at least 0"),
+        ("user.contact.delay", "contact.delay is common to all groups. Try: contact.delay"),
+        ("", "E622 an empty name is not a parameter of"),
+        ("contact.stiffness|--upper|900", "--upper: E204 contact.stiffness: expected N/m, got 900 (no"),
+        ("contact.stiffness|--upper|900", 'Try: --upper "900 N/m"'),
+        ("contact.stiffness|--lower|9 N/m|--upper|3 N/m", "E842 range of contact.stiffness: expected"),
+        ("contact.stiffness|--lower|-5 N/m", "E843 limit of contact.stiffness: expected at least 0"),
         (
             "topology.yaml|lan.delay",
-            f"{ORDER}topology.yaml, then lan.delay. Write: apc critical lan.delay topology.yaml\n",
+            f"{ORDER}topology.yaml, then lan.delay. Try: apc critical lan.delay topology.yaml\n",
         ),
         (
             "topology.yaml",
-            f"{ORDER}topology.yaml alone. Write: apc critical contact.stiffness topology.yaml\n",
+            f"{ORDER}topology.yaml alone. Try: apc critical contact.stiffness topology.yaml\n",
         ),
     ],
 )
@@ -499,10 +503,12 @@ class Known(SingleSegment):
 
     label = "number"
 
-    def __init__(self, radius: Callable[[float], float], band: float = 0.0) -> None:
-        self.radius, self.band = radius, band
+    def __init__(self, radius: Callable[[float], float], band: float = 0.0, *, slow: bool = True) -> None:
+        self.radius, self.band, self.slow = radius, band, slow
+        self.judged: list[float] = []
 
     def judge(self, value: Fraction) -> Verdict:
+        self.judged.append(float(value))
         radius = self.radius(float(value))
         stable = None if abs(radius - 1) <= self.band else radius < 1
         return Verdict(stable, radius, self.band, (), NO_PROOF)
@@ -510,13 +516,22 @@ class Known(SingleSegment):
     def smooth_segments(self) -> Iterator[SmoothSegment]:
         points = np.array([0.0, 1.0, 10.0, 50.0, 100.0])
         look = partial(pointwise, self.judge)
-        yield SmoothSegment(Fraction(0), Fraction(100), points, 1.0, look, self.judge, slow=True)
+        yield SmoothSegment(Fraction(0), Fraction(100), points, 1.0, look, self.judge, slow=self.slow)
 
 
 def test_a_crossing_on_an_end_of_a_cell_is_held_from_both_sides() -> None:
     for value in (10.0, 50.0):
         (one,) = search(Known(lambda at, value=value: 1 + (at - value) / 1e3, band=1e-12)).edges
         assert abs(one.value - value) <= one.error < 1e-8 and one.proof != ESTIMATE
+
+
+def test_a_search_for_the_first_loss_of_stability_evaluates_no_later_crossing() -> None:
+    # Zeros of a cubic: stability is lost at 5, regained at 30 and lost again at 70.
+    path = Known(lambda at: 1 + (at - 5) * (at - 30) * (at - 70) / 1e7, slow=False)
+    found = search(path, first=True)
+    assert [one.value for one in found.edges] == pytest.approx([5.0], rel=1e-9)
+    assert {one for one in path.judged if 10 < one < 99} == {50.0}  # a first sample
+    assert [one.value for one in search(path).edges] == pytest.approx([5.0, 30.0, 70.0], rel=1e-9)
 
 
 def test_an_end_that_stands_alone_is_no_crossing() -> None:
@@ -576,3 +591,36 @@ def test_a_critical_value_over_long_delays_is_as_close_as_its_analyses() -> None
     assert found.error < 1e-6 * found.value
     for factor, stable in ((1 - 1e-6, True), (1 + 1e-6, False)):
         assert apc.analyze(model, params={"pd.stiffness": factor * found.value}).stable is stable
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        (STIFFNESS, Fraction(600)),
+        ("lan.delay", Fraction(1, 100)),
+        ("coordination.delay", Fraction(1, 500)),
+        ("haptic.period", Fraction(1, 600)),
+        ("user.count", Fraction(4)),
+    ],
+)
+def test_the_evaluator_follows_from_what_a_parameter_changes(name: str, value: Fraction) -> None:
+    # A changed model shows it: another number of peers, frame or order of events, or none of them.
+    numeric = numeric_model(compiled(AVERAGE))
+    parameter_ref = find(numeric.model, name, counts=True)
+    changed = numeric.at(apply(numeric.model, [Override(parameter_ref, value)]))
+    expected = next(
+        kind
+        for kind, differs in (
+            (EvaluatorKind.COUNTS, changed.model.peers != numeric.model.peers),
+            (EvaluatorKind.PERIODS, changed.schedules[0].frame_s != numeric.schedules[0].frame_s),
+            (EvaluatorKind.DELAYS, changed.timings != numeric.timings),
+            (EvaluatorKind.MATRICES, True),
+        )
+        if differs
+    )
+    choice = evaluator_for(numeric, [parameter_ref])
+    assert (choice.kind, len(choice.linearized)) == (expected, 1)
+    assert evaluator_for(numeric, [find(numeric.model, STIFFNESS), parameter_ref]).kind is expected
+    scalar = evaluator_for(numeric, [parameter_ref], "mean-square")
+    continuous = expected in (EvaluatorKind.MATRICES, EvaluatorKind.DELAYS)
+    assert (scalar.kind, scalar.linearized) == (EvaluatorKind.POINTS if continuous else expected, ())

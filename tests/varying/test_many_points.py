@@ -14,8 +14,8 @@ import pytest
 import apc
 from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError
-from apc.eigen.ball_arithmetic import precision
-from apc.parameter_studies.batch_analysis import Analyses
+from apc.spectrum.ball_arithmetic import precision
+from apc.studies.batch_analysis import Analyses
 from tests.paper_limit import BITS, truth
 from tests.topologies import AVERAGE, MESH, OSCILLATOR, ROOT, TOPOLOGIES, compiled, replaced, told
 
@@ -184,20 +184,20 @@ def test_the_result_is_a_table_a_text_and_plain_data() -> None:
     assert found.stable.tolist() == [True, False, False] and found.to_dict()["spectral_radius"][2] is None
     first, second = str(found).splitlines()[:2]
     assert (first, second) == ("three-users-average: 3 points", "  contact.stiffness [N/m]: -1 … 2000")
-    assert "at 1 of them: contact.stiffness wants at least 0 N/m, got -1 N/m." in str(found)
+    assert "at 1 of them: contact.stiffness: expected at least 0 N/m, got -1 N/m." in str(found)
 
 
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({}, 'E883 nothing varies. Write: {"contact.stiffness": [500.0, 1000.0]}'),
+        ({}, 'E883 no parameter is varied. Try: {"contact.stiffness": [500.0, 1000.0]}'),
         (
             {"contact.stiffness": [math.nan]},
-            "E881 the values of contact.stiffness wants finite numbers, in N/m, got [nan].",
+            "E881 values of contact.stiffness: expected finite numbers, in N/m, got [nan].",
         ),
         (
             {"contact.stiffness": []},
-            "E881 the values of contact.stiffness wants finite numbers, in N/m, got [].",
+            "E881 values of contact.stiffness: expected finite numbers, in N/m, got [].",
         ),
         (
             {"contact.stiffness": [1.0, 2.0], "device.mass": [1.0, 2.0, 3.0]},

@@ -4,16 +4,26 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import apc
 from apc.__main__ import run
+from apc.analysis.analysis import analyze
 from apc.compiler.compiled import Model
-from apc.parameter_studies.margins import Margin
+from apc.lifting.numeric_model import numeric_model
+from apc.parameter_values.parameter_names import ParameterRef
+from apc.studies.evaluator import evaluator
+from apc.studies.margins import Margin
+from apc.studies.parameter_path import DelayPath, MatrixPath, verdict_of
+from apc.studies.timing_values import delay_now
+from tests import bruteforce
 from tests.topologies import AVERAGE, TOPOLOGIES, compiled, replaced
+from tests.truths import text_of
 from tests.varying.test_critical_values import HARD, PRESSED, stable_at
 
 SAMPLED = "stiffness: 1000 N/m, clock: haptic, delay: 1 ms"
@@ -116,7 +126,7 @@ def test_a_delay_is_scanned_far_enough_or_said_not_to_be() -> None:
     found = apc.margins(compiled(replaced(text, ("network: 8 ms", "network: 0.95 ms"))))
     row = next(one for one in found.rows if one.parameter == "lan.delay")
     assert row.value is None and re.fullmatch(r"\d+ orders of events up to 0\.012\d* s", row.note)
-    assert f"not looked for: {row.note}" in str(found)
+    assert f"not searched: {row.parameter}: {row.note}" in str(found)
 
 
 @pytest.mark.whole
@@ -148,7 +158,7 @@ def test_in_passing_what_takes_long_is_named_with_the_option_that_asks_for_it(
     (tmp_path / "topology.yaml").write_text(text, encoding="utf-8")
     assert run(["analyze", str(tmp_path / "topology.yaml")]) == 0
     text = capsys.readouterr().out
-    assert "not looked for in passing in so large a topology (apc analyze --margins does)" in " ".join(
+    assert "not computed by default for a topology of this size (apc analyze --margins)" in " ".join(
         text.split()
     )
     assert max(map(len, text.splitlines())) <= 80
@@ -161,9 +171,39 @@ def test_margins_are_those_of_the_function_and_left_out_where_they_are_not_wante
     path = str(tmp_path / "topology.yaml")
     Path(path).write_text(AVERAGE.replace("delay: 8 ms}", "delay: 8 ms, loss: 1 %}"), "utf-8")
     assert run(["analyze", path, "--no-margins"]) == 0
-    assert "margins not looked for: they were not wanted" in capsys.readouterr().out
+    assert "\n\n  not requested\n" in capsys.readouterr().out
     text = str(apc.margins(compiled(AVERAGE)))
-    assert "none found up to" in text and max(map(len, text.splitlines())) <= 80
+    assert "no limit up to" in text and max(map(len, text.splitlines())) <= 80
     for words in ([], ["--margins"]):
         assert run(["analyze", str(TOPOLOGIES / "three-users-average.yaml"), *words]) == 0
         assert text.rstrip() in capsys.readouterr().out
+
+
+def test_the_matrices_decide_both_sides_of_a_margin_together_as_brute_force_does() -> None:
+    topology = bruteforce.TopologySource(kt=500.0, kc=1000.0)
+    numeric = numeric_model(compiled(text_of(topology)))
+    free = ParameterRef("contact.stiffness")
+    path = MatrixPath(evaluator(numeric, [free]), numeric, np.array([1000.0]), 0)
+    values = [Fraction(500), Fraction(2000), Fraction(-1)]
+    *decided, invalid = path.decided_at(values[:2]) + path.decided_at(values[2:])
+    assert invalid is None  # below the minimum of the parameter
+    for value, verdict in zip(values, decided, strict=False):
+        matrix = np.array(bruteforce.frame_matrix(replace(topology, kc=float(value))))
+        eigenvalues = np.linalg.eigvals(matrix)
+        moving = np.delete(eigenvalues, np.argmin(np.abs(eigenvalues - 1.0)))  # without the translation
+        assert verdict is not None
+        assert verdict.radius == pytest.approx(np.abs(moving).max(), abs=1e-10)
+        assert verdict.stable == (np.abs(moving).max() < 1)
+    assert [verdict.stable for verdict in decided if verdict] == [True, False]
+
+
+def test_the_search_of_a_delay_begins_with_the_analysis_at_the_present_value() -> None:
+    numeric, free = numeric_model(compiled(AVERAGE)), ParameterRef("contact.delay")
+    present = delay_now(numeric.model, free)
+    known = {present: verdict_of(analyze(numeric))}
+    path = DelayPath(free, numeric, present, 2 * present, known=known)
+    first = next(path.smooth_segments())
+    values, _ = first.sample_at(first.points)
+    radius = 0.95717138962509  # of the brute-force matrix, without the translation
+    assert values[0, 0] == known[present].radius == pytest.approx(radius, abs=1e-13)
+    assert not path.rigid  # no other matrix was built

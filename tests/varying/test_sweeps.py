@@ -23,7 +23,7 @@ import pytest
 import apc
 from apc.__main__ import run
 from apc.compiler import signing
-from apc.sweeps.resumable_sweep import Sweep, sweep
+from apc.studies.resumable_sweep import Sweep, sweep
 from tests.sweeping import CHEAP, alive, children, parts, start, start_waiting, wait_for_parts
 from tests.topologies import AVERAGE, ONE_MASS, TOPOLOGIES, compiled, told
 
@@ -115,7 +115,7 @@ def test_a_point_at_fault_says_why_and_the_sweep_goes_on(tmp_path: Path) -> None
     found = sweep(compiled(text), {"tick.phase": "0,1.5 ms", "tick.period": "1,2 ms"}, out=target, jobs=1)
     assert list(found.column("verdict")) == ["stable", "stable", "error: E625", "stable"]
     assert math.isnan(found.column("spectral_radius")[2])
-    message = "tick.phase wants less than the clock's period, got 1.5 ms."
+    message = "tick.phase: expected less than the clock's period, got 1.5 ms."
     assert found.column("message").tolist() == ["", "", message, ""]
     assert target.read_text(encoding="utf-8").splitlines()[3] == f'0.0015,0.001,error: E625,,,,,,"{message}"'
     assert f"at 1 of them: {message}" in str(found)
@@ -162,38 +162,47 @@ def test_a_range_or_list_gives_exact_values(text: str, values: list[Fraction]) -
 
 
 FORM = "--over contact.stiffness='100 N/m:3000 N/m:30'"
-RANGE = "E881 the range of contact.stiffness wants "
-MANY = "E883 a sweep wants at most 10,000,000 points, got "
+RANGE = "E881 range of contact.stiffness: expected "
+MANY = "E883 sweep: expected at most 10,000,000 points, got "
 
 
 @pytest.mark.parametrize(
     ("over", "message"),
     [
-        ({}, f"E883 nothing is swept. Write: {FORM}"),
+        ({}, f"E883 no parameter is swept. Try: {FORM}"),
         (
             {"contact.stiffness": "3 N/m:1 N/m"},
-            f"{RANGE}its lower end first, and the upper above it, got 3 N/m to 1 N/m.",
+            f"{RANGE}the lower end first, got 3 N/m to 1 N/m. Try: contact.stiffness=1 N/m:3 N/m",
         ),
-        ({"contact.stiffness": "1 N/m:9 N/m:0"}, f"{RANGE}2 values or more, got 0. Write: {FORM}"),
-        ({"contact.stiffness": "1 N/m:9 N/m:"}, f"{RANGE}2 values or more, got nothing. Write: {FORM}"),
+        (
+            {"contact.stiffness": "3:1 N/m:4:log"},
+            f"{RANGE}the lower end first, got 3 to 1 N/m. Try: contact.stiffness=1 N/m:3 N/m:4:log",
+        ),
+        ({"contact.stiffness": "1 N/m:9 N/m:0"}, f"{RANGE}2 values or more, got 0. Try: {FORM}"),
+        ({"contact.stiffness": "1 N/m:9 N/m:"}, f"{RANGE}2 values or more, got nothing. Try: {FORM}"),
         (
             {"contact.stiffness": "1 N/m:2 N/m:3:4"},
-            f"{RANGE}LOW:HIGH:COUNT or LOW:HIGH:COUNT:log, got 1 N/m:2 N/m:3:4. Write: {FORM}",
+            f"{RANGE}LOW:HIGH:COUNT or LOW:HIGH:COUNT:log, got 1 N/m:2 N/m:3:4. Try: {FORM}",
         ),
         (
             {"contact.stiffness": "0 N/m:9 N/m:3:log"},
-            f"{RANGE}a lower end above 0 for equal ratios, got 0 N/m.",
+            f"{RANGE}a lower end above 0 for a logarithmic range, got 0 N/m. "
+            "Try: contact.stiffness=0.09 N/m:9 N/m:3:log",
         ),
         (
             {"contact.stiffness": "5 N/m, 1 N/m, 5 N/m"},
-            "E881 the list of contact.stiffness wants different values, got 5 N/m twice.",
+            "E881 list of contact.stiffness: expected different values, got 5 N/m twice. "
+            "Try: contact.stiffness=5 N/m, 1 N/m",
         ),
         (
             {"contact.stiffness": "1 kg:2 Kg:11:log"},
-            "E204 contact.stiffness wants N/m, got 1 kg. Write: contact.stiffness=1 N/m:2 N/m:11:log",
+            "E204 contact.stiffness: expected N/m, got 1 kg. Try: contact.stiffness=1 N/m:2 N/m:11:log",
         ),
-        ({"user.count": "2.5:10"}, "E881 the range of user.count wants whole numbers, got 2.5 to 10."),
-        ({"user.device.mass": "-1 kg:1 kg"}, "E624 user.device.mass wants more than 0 kg, got -1 kg."),
+        (
+            {"user.count": "2.5:10"},
+            "E881 range of user.count: expected whole numbers, got 2.5 to 10. Try: user.count=3:10",
+        ),
+        ({"user.device.mass": "-1 kg:1 kg"}, "E624 user.device.mass: expected more than 0 kg, got -1 kg."),
         (
             {"contact.stiffness": "1,2 N/m", "couplers.contact.stiffness": "3,4 N/m"},
             "E883 contact.stiffness is swept twice.",
@@ -215,20 +224,23 @@ def test_a_faulty_axis_gets_one_clear_message(over: dict[str, str], message: str
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"of": "critical:it.stiffness"}, "sweep: E884 it.stiffness is swept: there is nothing to look for"),
+        (
+            {"of": "critical:it.stiffness"},
+            "sweep: E884 it.stiffness is swept, so its critical value is undefined",
+        ),
         (
             {"of": "analyse"},
-            "sweep: E884 analyse is nothing a sweep computes (analyze, critical). Write: analyze",
+            "sweep: E884 analyse is not a quantity of a sweep (analyze, critical). Try: analyze",
         ),
-        ({"of": ""}, "sweep: E884 an empty name is nothing a sweep computes (analyze, critical)."),
-        ({"of": "analyze:x"}, "sweep: E884 analyze wants no parameter, got x. Write: --of analyze"),
-        ({"of": "critical"}, "sweep: E884 critical wants a parameter, got nothing. Write: --of critical:"),
-        ({"of": "critical:it.dampin"}, "sweep: E622 it.dampin is no parameter of wall. Write: it.damping"),
+        ({"of": ""}, "sweep: E884 an empty name is not a quantity of a sweep (analyze, critical)."),
+        ({"of": "analyze:x"}, "sweep: E884 analyze: expected no parameter, got x. Try: --of analyze"),
+        ({"of": "critical"}, "sweep: E884 critical: expected a parameter, got nothing. Try: --of critical:"),
+        ({"of": "critical:it.dampin"}, "sweep: E622 it.dampin is not a parameter of wall. Try: it.damping"),
         (
             {"out": Path("r.txt")},
-            'r.txt: E878 the suffix of out wants one of .csv, .parquet, got .txt. Write: out="r.csv"',
+            'r.txt: E878 suffix of out: expected one of .csv, .parquet, got .txt. Try: out="r.csv"',
         ),
-        ({"jobs": 0}, "sweep: E889 the number of processes wants 1 or more, got 0."),
+        ({"jobs": 0}, "sweep: E889 number of processes: expected 1 or more, got 0."),
     ],
 )
 def test_a_faulty_wish_is_told_before_anything_is_computed(given: dict[str, object], message: str) -> None:
@@ -271,8 +283,8 @@ def test_a_part_that_is_not_as_it_was_written_is_computed_again(
     (tmp_path / "own").write_text("mine", encoding="utf-8")
     DAMAGES[damage](last)
     found = small(out=target, jobs=1)
-    repeated = "part 1 was damaged, or written by somebody else, and is computed again"
-    assert found.notes == (repeated, "64 points were there already")
+    repeated = "part 1 was damaged or written by another user and is computed again"
+    assert found.notes == (repeated, "64 points were computed before")
     assert target.read_bytes() == whole and not last.parent.exists()
     assert (tmp_path / "own").read_text(encoding="utf-8") == "mine"
 
@@ -296,7 +308,7 @@ def test_without_a_place_for_a_secret_a_process_takes_up_what_it_wrote_itself(
     (tmp_path / "file").touch()
     monkeypatch.setattr(signing, "_folder", lambda: tmp_path / "file" / "cache")
     interrupted(tmp_path / "r.csv")
-    assert small(out=tmp_path / "r.csv", jobs=1).notes == ("128 points were there already",)
+    assert small(out=tmp_path / "r.csv", jobs=1).notes == ("128 points were computed before",)
 
 
 @pytest.mark.whole
@@ -309,7 +321,7 @@ def test_sweeps_of_one_target_and_what_others_put_beside_leave_each_other_alone(
     other = sweep(MODEL, {"device.mass": "1 kg:2 kg:20"}, out=target, jobs=1)
     assert not other.notes and other.points == 20
     assert set(stored) < set(stored[0].parent.iterdir())
-    assert small(out=target, jobs=1).notes == ("128 points were there already",)
+    assert small(out=target, jobs=1).notes == ("128 points were computed before",)
     assert sorted(stored[0].parent.iterdir()) == sorted(notes)
     assert {path.read_text() for path in notes} == {"mine"}
 
@@ -320,7 +332,7 @@ def test_what_is_no_folder_in_its_place_is_refused_and_stays(tmp_path: Path, pee
     (tmp_path / "other").mkdir()
     folder.write_text("thesis", encoding="utf-8") if peer_type == "file" else folder.symlink_to("other")
     (message,) = told(lambda: small(out=tmp_path / "w.csv", jobs=1))
-    assert message.startswith(f"{folder}: E885 is there and is no folder")
+    assert message.startswith(f"{folder}: E885 already exists and is not a folder")
     assert list((tmp_path / "other").iterdir()) == []
 
 
@@ -351,7 +363,7 @@ def test_a_full_disk_keeps_what_is_finished(tmp_path: Path, whole: bytes) -> Non
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert message.endswith("E601 can't be written: File too large.")
     assert len(parts(target)) == 2 and not target.exists()
-    assert small(out=target, jobs=1).notes == ("128 points were there already",)
+    assert small(out=target, jobs=1).notes == ("128 points were computed before",)
     assert target.read_bytes() == whole
 
 
@@ -390,7 +402,7 @@ def test_killed_three_times_it_gives_the_file_of_one_left_alone(folder: Path) ->
     last = start(folder, *LONG, "--out", "r.csv", "--jobs", "1")
     out, err = last.communicate()
     assert (last.returncode, err) == (0, "")
-    assert f"note: {64 * len(before):,} points were there already" in out
+    assert f"note: {64 * len(before):,} points were computed before" in out
     assert left_alone.communicate()[1] == ""
     assert target.read_bytes() == (folder / "alone.csv").read_bytes()
     assert len(target.read_text(encoding="utf-8").splitlines()) == 501
@@ -406,7 +418,7 @@ def test_an_interrupt_ends_with_what_is_done_and_says_how_to_go_on(folder: Path)
     out, err = running.communicate()
     assert (running.returncode, out) == (130, "")
     first, second = (line for line in err.splitlines() if line)
-    assert first.endswith(" of 500 points are kept in r.csv.parts; the same command takes up from there")
+    assert first.endswith(" of 500 points are stored in r.csv.parts; the same command resumes the sweep")
     assert second == "stopped"
     assert not target.exists() and len(parts(target)) == 2
 

@@ -106,6 +106,7 @@ def test_the_commands_that_set_vary_or_play_a_delay_agree(
     assert np.interp(200, points[:, 1], points[:, 0]) == pytest.approx(LIMIT, rel=1e-3)
 
 
+@pytest.mark.needs_extension("event_order", "parameter_boxes")
 def test_a_box_and_tuned_gains_are_those_of_the_delay_that_is_set(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -154,9 +155,9 @@ def test_a_group_without_a_delay_of_its_own_is_refused_with_the_setting_to_write
     path = tmp_path / "t.yaml"
     path.write_text(TWO, encoding="utf-8")
     assert run(["analyze", str(path), "--set", f"a.{NAME}=20 ms"]) == 1
-    hint = "{a: {count: 1, set: {coordination.delay: 0 ms}}}"
-    assert hint in " ".join(capsys.readouterr().err.split())
-    pasted = compiled(replaced(TWO, ("a: {count: 1}", hint[1:-1])))
+    fix = "{a: {count: 1, set: {coordination.delay: 0 ms}}}"
+    assert fix in " ".join(capsys.readouterr().err.split())
+    pasted = compiled(replaced(TWO, ("a: {count: 1}", fix[1:-1])))
     truth = apc.analyze(compiled(replaced(TWO, ("delay: 0 ms", "delay: 20 ms")))).spectral_radius
     assert apc.analyze(pasted, params={f"a.{NAME}": "20 ms"}).spectral_radius == pytest.approx(
         truth, rel=1e-12
@@ -171,8 +172,8 @@ def test_a_clock_and_a_link_keep_their_own_names_and_the_answer_names_what_they_
     path.write_text(text, encoding="utf-8")
     assert run(["analyze", str(path), "--set", "haptic.period=0.5 ms", "--set", "lan.delay=8 ms"]) == 0
     notes = capsys.readouterr().err
-    assert "haptic.period is of the clock haptic, the clock of a only" in notes
-    assert "lan.delay is the delay of all pairs of groups but those of lan.delays.a.b" in notes
+    assert "haptic.period belongs to clock haptic, which only a uses" in notes
+    assert "lan.delay applies to all pairs of groups except those of lan.delays.a.b" in notes
     there = replaced(
         text, ("haptic: 1 ms", "haptic: 0.5 ms"), ("{clock: network, delay: 2", "{clock: network, delay: 8")
     )

@@ -1,0 +1,99 @@
+"""Texts of results: their order, their width, and the digits that errors permit."""
+
+from __future__ import annotations
+
+import json
+import re
+from fractions import Fraction
+from math import floor, log10
+from pathlib import Path
+
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from apc.output.formatting import full_digits, with_error
+from tests.commands import Cli
+from tests.topologies import TOPOLOGIES
+
+TITLES = ("Stability margins", "Sensitivity of", "Modes (")
+LEGEND = "(-T): value at T before the frame; sent(-T): value sent at that time"
+PACKETS = 2 / 3  # participation from which a mode belongs to packets in transit
+
+
+@pytest.mark.needs_extension("event_order")
+@pytest.mark.parametrize("name", ["three-users-average", "teleoperation-pair", "unlike-devices"])
+def test_an_analysis_prints_verdict_summary_margins_sensitivities_and_modes(name: str, cli: Cli) -> None:
+    """At most 45 lines of 80 columns; packets in transit take one line, counted here from the JSON data."""
+    ran = cli(f"analyze {TOPOLOGIES / name}.yaml")
+    lines = ran.out.splitlines()
+    assert lines[0] == f"{name}: stable up to a common translation"
+    at = [next(row for row, line in enumerate(lines) if line.startswith(title)) for title in TITLES]
+    summary = next(row for row, line in enumerate(lines) if line.startswith("  spectral radius"))
+    assert summary < at[0] and at == sorted(at)
+    assert len(lines) <= 45 and max(map(len, lines)) <= 80
+
+    modes = json.loads(cli(f"analyze {TOPOLOGIES / name}.yaml --json").out)["modes"]
+    pairs = [mode for mode in modes if mode["magnitude"] > 1e-6 and mode["eigenvalue"][1] >= -mode["error"]]
+    shares = [
+        sum(share for state, share in mode["participation"].items() if " sent(" in state) for mode in pairs
+    ]
+    folded = sum(share > PACKETS for share in shares[1:])
+    found = re.search(r"(\d+) transport-delay modes?", ran.out)
+    assert (int(found[1]) if found else 0) == folded
+
+
+def test_every_mode_has_a_row_if_all_are_requested(cli: Cli) -> None:
+    file = TOPOLOGIES / "teleoperation-pair.yaml"
+    text = cli(f"analyze {file} --modes all").out.partition("Modes (")[2]
+    modes = json.loads(cli(f"analyze {file} --json").out)["modes"]
+    rows = [line for line in text.splitlines() if re.match(r" +\d\.\d", line)]
+    assert len(rows) == sum(mode["eigenvalue"][1] >= -mode["error"] for mode in modes)
+    assert "not shown" not in text and "transport-delay" not in text
+
+
+def test_full_digits_are_those_of_the_data_with_their_errors(cli: Cli) -> None:
+    words = f"critical coordination.stiffness {TOPOLOGIES / 'three-users-average.yaml'}"
+    crossing = json.loads(cli(f"{words} --json").out)["crossings"][0]
+    short, full = cli(words).out, cli(f"{words} --digits full").out
+    assert f"{crossing['value']:.6g} N/m" in short and "±" not in short
+    value, error = re.search(r"([\d.]+) N/m ± (\S+)", full).groups()  # type: ignore[union-attr]
+    assert abs(Fraction(value) - Fraction(crossing["value"])) <= Fraction(error)
+    assert crossing["error"] <= float(error) <= 10 * crossing["error"]
+
+
+@given(st.floats(1e-9, 1e9), st.floats(-20, 3))
+@example(9.999996, -6)  # rounds to another power of ten
+@example(1.0000049, -6)
+def test_no_digit_is_printed_that_an_error_could_change_by_more_than_one(value: float, power: float) -> None:
+    """Six digits alone state a number to half a unit of the sixth; its error is at most another half."""
+    error = value * 10.0**power
+    text = with_error(value, error, "N")
+    if "±" in text:
+        number, bound = text.removesuffix(" N").replace(" N", "").split(" ± ")
+        assert abs(Fraction(number) - Fraction(value)) + Fraction(error) <= Fraction(bound) * Fraction(
+            101, 100
+        )
+        return
+    printed = Fraction(text.removesuffix(" N"))
+    unit = Fraction(10) ** (floor(log10(float(printed)) + 1e-12) - 5)
+    assert abs(printed - Fraction(value)) <= unit / 2 and Fraction(error) <= unit / 2 * Fraction(101, 100)
+    with full_digits():
+        assert "±" in with_error(value, error, "N")
+
+
+@pytest.mark.few(4)
+@pytest.mark.parametrize("file", sorted(TOPOLOGIES.glob("*.yaml")), ids=lambda file: file.stem)
+def test_no_line_is_wider_than_a_terminal_and_no_cell_of_a_margin_is_broken(file: Path, cli: Cli) -> None:
+    ran = cli(f"analyze {file}")
+    lines = ran.out.splitlines()
+    assert max(map(len, lines)) <= 80
+    margins = ran.out.partition("Stability margins")[2].partition("\n\n")[2].partition("\n\n")[0]
+    assert not any(re.match(r" {20,}\S", line) for line in margins.splitlines())
+
+
+@pytest.mark.parametrize(("name", "has_legend"), [("three-users-average", True), ("client-server", False)])
+def test_past_values_among_the_participations_have_a_legend(name: str, has_legend: bool, cli: Cli) -> None:
+    text = cli(f"analyze --no-margins {TOPOLOGIES / name}.yaml").out.partition("Modes (")[2]
+    table, legend, _ = text.partition(f"  {LEGEND}\n")
+    assert (bool(legend), bool(re.search(r"\(-\d", table))) == (has_legend, has_legend)
