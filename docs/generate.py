@@ -1,0 +1,172 @@
+"""Pages of the manual that are made from the program: components, topologies, messages, tutorials.
+
+Takes: the sources of this checkout. Gives: `write_pages`.
+Guarantees: a page is written only if its text has changed, so that Sphinx reads only those again.
+Does not: execute notebooks; their outputs are stored with them.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+from latex import equation_latex
+
+import apc
+from apc.compiler.components.component import Component
+from apc.compiler.components.component_library import Library
+from apc.compiler.message_catalogue import catalogue, ranges
+from apc.compiler.view.catalogue import component_document, library_document, topologies
+from apc.compiler.view.listing import diagram_of
+from apc.output.graph import graph_picture
+from apc.output.pictures import svg_text
+
+ROOT = Path(__file__).parent.parent
+TUTORIALS = ROOT / "models" / "notebooks"
+MESSAGES = ROOT / "tests" / "language" / "messages.txt"
+FOLDERS = {
+    "contacts": "Contacts",
+    "coordination": "Coordination",
+    "devices": "Devices",
+    "hands": "Operators",
+    "mechanics": "Mechanics",
+    "network": "Network",
+}
+
+
+def write_pages(docs: Path) -> None:
+    """Write all generated pages below a folder of documents."""
+    library = Library(())
+    for folder, rows in library_document(library).items():
+        _write(docs / "reference" / "components" / f"{folder}.md", _components(library, folder, rows))
+    _write(docs / "reference" / "topologies.md", "\n".join(_gallery(docs / "_static" / "topologies")))
+    _write(docs / "reference" / "messages.md", "\n".join(_messages()))
+    for notebook in sorted(TUTORIALS.glob("*.ipynb")):
+        _write(docs / "tutorial" / notebook.name, notebook.read_text(encoding="utf-8"))
+
+
+def _write(path: Path, text: str) -> None:
+    """Write a text file unless it has this text."""
+    if not path.is_file() or path.read_text(encoding="utf-8") != text:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8")
+
+
+def _folded(title: str, text: str) -> Iterator[str]:
+    """Yield a block of YAML that a reader opens."""
+    yield from (f"<details><summary>{title}</summary>", "", "```yaml", text, "```", "", "</details>", "")
+
+
+# ---- components ----
+
+
+def _components(library: Library, folder: str, rows: list[dict[str, str]]) -> str:
+    """Return the page of the components of one folder of the library."""
+    lines = [f"# {FOLDERS[folder]}", ""]
+    lines += ["| component | description |", "|---|---|"]
+    lines += [
+        f"| [`{row['name']}`](#{row['name'].lower()}) | {row['description'].partition('. ')[0].rstrip('.')} |"
+        for row in rows
+    ]
+    for row in rows:
+        lines += ["", f"## {row['name']}", "", *_component(library, row["name"])]
+    return "\n".join(lines) + "\n"
+
+
+def _component(library: Library, name: str) -> Iterator[str]:
+    """Yield the section of a component: description, source, parameters, equations, and definition."""
+    facts = component_document(library, name)
+    yield facts["description"]
+    yield ""
+    if facts["source"]:
+        yield f"Source: {facts['source']}."
+        yield ""
+    if facts["connectors"]:
+        yield "Connectors: " + ", ".join(f"`{key}` ({value})" for key, value in facts["connectors"].items())
+        yield ""
+    yield from _parameters(facts["parameters"])
+    component = library.component(name)
+    if component is not None:
+        yield from _equations(component)
+    for title, text in facts["definitions"].items():
+        yield from _folded(f"Definition of {title}", text)
+
+
+def _parameters(rows: list[dict[str, str]]) -> Iterator[str]:
+    """Yield the table of parameters."""
+    if not rows:
+        return
+    yield "| parameter | unit | default | limits | description |"
+    yield "|---|---|---|---|---|"
+    for row in rows:
+        cells = (f"`{row['name']}`", row["unit"], row["value"], row["limits"], row["description"])
+        yield f"| {' | '.join(cell.replace('|', '&#124;') for cell in cells)} |"
+    yield ""
+
+
+def _equations(component: Component) -> Iterator[str]:
+    """Yield the equations, typeset; those of the entries of a vector are written once, as in the source."""
+    entries = {equation.text: [each for each in component.equations if each.text == equation.text]
+               for equation in component.equations}  # fmt: skip
+    for text, equations in entries.items():
+        if len(equations) > 1:  # a vector equation
+            yield from ("```text", text, "```", "")
+        else:
+            yield from ("$$", equation_latex(equations[0]), "$$", "")
+    if component.linearized is not None:
+        yield f"In a linear analysis (valid for {component.linearized.valid}):"
+        yield ""
+        for equation in component.linearized.equations:
+            yield from ("$$", equation_latex(equation), "$$", "")
+
+
+# ---- topologies ----
+
+
+def _gallery(pictures: Path) -> Iterator[str]:
+    """Yield the page of the shipped topologies: verdict, picture and text of each."""
+    yield "# Topologies"
+    yield ""
+    yield "`apc new --like NAME` copies a topology to `NAME.yaml`; `apc new --list` lists them."
+    yield ""
+    for name, path in topologies().items():
+        model = apc.compile(path)
+        _write(pictures / f"{name}.svg", svg_text(graph_picture(diagram_of(path))))
+        yield from (f"## {name}", "", model.description, "")
+        yield f"Verdict of `apc analyze`: *{apc.analyze(model).verdict}*."
+        yield ""
+        yield f"![Peers, parts and links of {name}](../_static/topologies/{name}.svg)"
+        yield ""
+        yield from _folded("Topology", path.read_text(encoding="utf-8").rstrip())
+
+
+# ---- messages ----
+
+
+def _messages() -> Iterator[str]:
+    """Yield the page of message codes: cause, remedy and an example of each."""
+    examples = _examples()
+    headings = dict(ranges())
+    yield "# Messages"
+    yield ""
+    yield "Codes that begin with E are errors, codes that begin with W are warnings. A message reads"
+    yield "`FILE:LINE:COLUMN: CODE subject: expected …, got …. Advice. Try: FIX`. A fix can be pasted."
+    for code, entry in sorted(catalogue().items()):
+        if heading := headings.pop(code[:2], ""):
+            yield from ("", f"## {code[0]}{code[1]}xx: {heading}")
+        yield from ("", f"### {code}: {entry.title}", "", entry.cause, "", entry.remedy, "")
+        text = examples.get(code, "")
+        if entry.example is not None:
+            text = f"$ {entry.example.command}\n{entry.example.message}"
+        if text:
+            yield from ("```text", text, "```")
+
+
+def _examples() -> dict[str, str]:
+    """Return the first example of each code in the tested list of messages: the edit and the message."""
+    examples: dict[str, str] = {}
+    for block in MESSAGES.read_text(encoding="utf-8").split("\n\n"):
+        if found := re.search(r"^(?:\d+:\d+|\S*?): ([EW]\d{3}) ", block, re.MULTILINE):
+            examples.setdefault(found[1], block.strip("\n"))
+    return examples
