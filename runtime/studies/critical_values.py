@@ -18,7 +18,6 @@ from typing import Any, Unpack
 import numpy as np
 
 from apc.analysis.analysis import analyze, near_start
-from apc.analysis.one_sided_slopes import sides
 from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.timings import part
@@ -347,7 +346,7 @@ def _search_by_criterion(
         paths = [DelayPath(parameter_ref, start, begin, end, ended) for start in choice.linearized]
         reported = None
     elif choice.kind is EvaluatorKind.POINTS:
-        paths = [_pointwise_path(side.numeric, parameter_ref, ends, NOMINAL) for side in sides(numeric)]
+        paths = [_pointwise_path(numeric, parameter_ref, ends, NOMINAL)]  # all sides at each value
     else:
         paths = [_path_without_times(start, parameter_ref, ends) for start in choice.linearized]
     result = stable_in_all([search(path, progress=reported) for path in paths])

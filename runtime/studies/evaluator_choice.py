@@ -17,7 +17,7 @@ from apc.analysis.one_sided_slopes import sides
 from apc.compiler.compiled import Model
 from apc.lifting.numeric_model import NumericModel
 from apc.parameter_values.parameter_names import ParameterRef
-from apc.studies.evaluator import reaches_count, reaches_time
+from apc.studies.evaluator import generic, reaches_count, reaches_time
 from apc.studies.stability_criteria import NOMINAL, SCALAR_CRITERIA
 from apc.studies.timing_values import reaches_period
 
@@ -76,7 +76,7 @@ def evaluator_for(
         As for `analysis.prepare_at_start`.
     """
     scalar = criterion in SCALAR_CRITERIA
-    models = [] if scalar else [side.numeric for side in sides(numeric)]
+    models = [] if scalar or _sides_change(numeric, parameter_refs) else [s.numeric for s in sides(numeric)]
     starts = [prepare_at_start(model, parameter_refs) for model in models]
     linearized = () if None in starts else tuple(start for start in starts if start is not None)
     smooth = linearized[0] if linearized and models[0] is numeric else None
@@ -84,3 +84,13 @@ def evaluator_for(
     timed = [EvaluatorKind.COUNTS, EvaluatorKind.PERIODS, *([] if scalar else [EvaluatorKind.DELAYS])]
     untimed = EvaluatorKind.MATRICES if linearized else EvaluatorKind.POINTS
     return EvaluatorChoice(next((kind for kind in timed if kind in required), untimed), linearized, smooth)
+
+
+def _sides_change(numeric: NumericModel, parameter_refs: Sequence[ParameterRef]) -> bool:
+    """Return whether the start has more or fewer one-sided linear models at other values of the parameters.
+
+    The sides of max(k x, l x) at x = 0 are one where k = l, and two at any other k.
+    """
+    system = numeric.model
+    gains = [ref for ref in parameter_refs if kind_for_parameter(system, ref) is EvaluatorKind.MATRICES]
+    return bool(gains) and len(sides(numeric.at(generic(system, gains)))) != len(sides(numeric))

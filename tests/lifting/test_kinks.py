@@ -131,6 +131,20 @@ def test_a_critical_value_is_that_of_the_worse_side(tmp_path: Path) -> None:
     assert radius(found.value * (1 - 1e-9)) < 1 < radius(found.value * (1 + 1e-9))
 
 
+@pytest.mark.parametrize("gain", ["gain", "other"])
+def test_sides_of_equal_slopes_part_where_a_gain_varies(gain: str, tmp_path: Path) -> None:
+    """max(k x, l x) with k = l has one slope; at any other value of k or l it has two."""
+    text = component(f"f = K*max(gain*{X}, other*{X})", "flange.f = hold(f)", variables="f=N")
+    numbers = "parameters:\n  gain: {unit: 1, default: 1}\n  other: {unit: 1, default: 1}\n"
+    text = text.replace("parameters:\n", numbers)
+    system = compiled(topology(", K: 10 kN/m"), library(tmp_path, text))
+    assert not apc.analyze(system).sides
+    found = apc.critical(system, f"own.{gain}")
+    assert found.value == pytest.approx(4.0133778369378, rel=1e-9)
+    many = apc.analyze_many(system, {f"own.{gain}": [1.0, 2.0, 5.0]})
+    assert many.spectral_radius == pytest.approx([radius(10e3), radius(20e3), radius(50e3)], abs=1e-12)
+
+
 def test_passive_hands_meet_the_whole_wall() -> None:
     """A wall of stiffness 0 and damping B at zero depth: b > B decides (Colgate and Schenkel), not B/2."""
     for damping, passive in ((1.9, True), (2.1, False)):
