@@ -55,7 +55,7 @@ def connection_equations(
                 message = f"{part.name} is connected to {other}, but a group with {part.name} has no {other}"
                 advice = f"use the same groups in at: of {part.name} and {other}"
                 mistakes.add("E210", part.location, message, advice=advice)
-    for members in {id(members): members for members in set_of.values()}.values():
+    for members in dict.fromkeys(map(tuple, set_of.values())):
         terminals = [terminal for terminal in members if terminal not in passed]
         location, type_ = by_name[terminals[-1][0]].location, connectors[terminals[0]]
         is_free = grounded.isdisjoint(members)

@@ -242,8 +242,8 @@ def lifted(
         driven_peers = [_open_loop(system, group, "" if link else open_at, numbers) for group in groups]
         _check_size(system, driven_peers)
         loop = dense_loop([item.group for item in driven_peers], exchange)
-        peers_by_schedule = {id(item.group.schedule): item for item in driven_peers}
-        subsystems = [peers_by_schedule[id(subsystem.schedule)] for subsystem in loop.subsystems]
+        peers_of_class = {item.group.index: item for item in driven_peers}
+        subsystems = [peers_of_class[subsystem.index] for subsystem in loop.subsystems]
         blocks, labels = _closed(loop, subsystems, link=link, open_at=open_at, arithmetic=numbers.arithmetic)
     notes = () if open_at else tuple(dict.fromkeys(note for item in driven_peers for note in item.unpushed))
     return blocks, labels, notes

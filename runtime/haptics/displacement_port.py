@@ -137,7 +137,7 @@ def port_loops(numeric: NumericModel, *, option: str) -> tuple[PortLoop, ...]:
         for row in rows
     }
     direct = coupled_directly(system.peer_types)
-    input_of_schedule: dict[int, _DeviceInput] = {}
+    device_inputs: dict[int, _DeviceInput] = {}
     with_inputs: list[PeerClass] = []
     for group in groups:
         device = find_device(
@@ -154,19 +154,19 @@ def port_loops(numeric: NumericModel, *, option: str) -> tuple[PortLoop, ...]:
             why, advice = interaction
             raise ApcError(Diagnostic("E933", location, f"{option}: {why}", advice=advice))
         device_input = _with_device_input(group, device)
-        input_of_schedule[id(device_input.group.schedule)] = device_input
+        device_inputs[group.index] = device_input
         with_inputs.append(device_input.group)
-    if not input_of_schedule:
+    if not device_inputs:
         raise no_device(system, option)
     loops, weighted = _energy_loops(system, with_inputs, exchange, option=option)
     result = []
     for loop in loops:
         # A loop without devices is one of the model with its devices clamped.
-        if any(id(subsystem.schedule) in input_of_schedule for subsystem in loop.subsystems):
+        if any(subsystem.index in device_inputs for subsystem in loop.subsystems):
             represents_all = weighted and len(loop.subsystems) > 1
             result.append(
                 _port_loop(
-                    loop, input_of_schedule, represents_all=represents_all, location=location, option=option
+                    loop, device_inputs, represents_all=represents_all, location=location, option=option
                 )
             )
     return tuple(result)
@@ -294,7 +294,7 @@ def _energy_loops(
 
 def _port_loop(
     loop: ModalSystem,
-    input_of_schedule: Mapping[int, _DeviceInput],
+    device_inputs: Mapping[int, _DeviceInput],
     *,
     represents_all: bool,
     location: SourceLocation,
@@ -306,19 +306,15 @@ def _port_loop(
     ----------
     loop
         The loop.
-    input_of_schedule
-        The device inputs, by the schedule's id.
+    device_inputs
+        The device inputs, by the index of the class.
     represents_all
         Whether a device of the loop represents all peers of its subsystem's count.
     location, option
         The location and the command-line option, for messages.
     """
-    gripped = [
-        number
-        for number, subsystem in enumerate(loop.subsystems)
-        if id(subsystem.schedule) in input_of_schedule
-    ]
-    subsystems = [input_of_schedule[id(loop.subsystems[number].schedule)] for number in gripped]
+    gripped = [number for number, subsystem in enumerate(loop.subsystems) if subsystem.index in device_inputs]
+    subsystems = [device_inputs[loop.subsystems[number].index] for number in gripped]
     counts = [loop.subsystems[number].count if represents_all else 1 for number in gripped]
     lengths = [len(subsystem.seconds) for subsystem in subsystems]
     if (m := sum(lengths)) > MOST_INTERVALS:

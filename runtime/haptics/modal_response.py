@@ -161,10 +161,10 @@ def driven_mode(loop: ModalSystem, subsystems: Mapping[int, DrivenPeer]) -> Driv
     Parameters
     ----------
     loop, subsystems
-        The loop of classes from `driven_subsystem`, and their driven peers by the schedule's id.
+        The loop of classes from `driven_subsystem`, and their driven peers by the index of the class.
     """
     closed = close_loop(loop)
-    driven_peers = [subsystems[id(group.schedule)] for group in loop.subsystems]
+    driven_peers = [subsystems[group.index] for group in loop.subsystems]
     closed_matrix = with_error_radius(closed.matrix, closed.error)
     pairs = list(zip(closed.offsets, driven_peers, strict=True))
     added = [start + index for start, subsystem in pairs for index in subsystem.ports.added]

@@ -90,7 +90,7 @@ def responses(numeric: NumericModel, port: DevicePort, other: DevicePort) -> Res
         _check_increments(system, group)
         peer_group, subsystem = driven_subsystem(group, device)
         driven_classes.append(peer_group)
-        subsystems[id(peer_group.schedule)] = subsystem
+        subsystems[peer_group.index] = subsystem
     plain, driven_loops = (
         _loops_by_class(system, groups, exchange),
         _loops_by_class(system, driven_classes, exchange),

@@ -38,13 +38,14 @@ class StartClasses:
         self.peers = [peers.first for peers in classes]
         self.groups = list(map(exchange.group_of, self.peers))
         self.vectors = list(map(numeric.vector, self.peers))
+        self.peer_types = [numeric.model.groups[group].peer_type for group in self.groups]
         self.subsystems = [numeric.subsystems[group] for group in self.groups]
         self.schedules = [numeric.schedules[group] for group in self.groups]
         exact: dict[tuple[int, bytes], tuple[list[Fraction], dict[str, list[Fraction]]]] = {}
         self.parameters: list[list[Fraction]] = []
         self.sent: list[dict[str, list[Fraction]]] = []
-        for subsystem, vector in zip(self.subsystems, self.vectors, strict=True):
-            key = (id(subsystem), vector.tobytes())
+        for subsystem, peer_type, vector in zip(self.subsystems, self.peer_types, self.vectors, strict=True):
+            key = (peer_type, vector.tobytes())
             if key not in exact:
                 parameters = exact_numbers(subsystem.peer_type, vector)
                 exact[key] = parameters, start_sends(subsystem, parameters)
@@ -153,7 +154,7 @@ class StartClasses:
         result = {}
         for h, _, _ in senders:
             sent = self.sent[h][receive.link][: edge.function.numel_in(3)]
-            key = (id(edge), self.vectors[g].tobytes(), tuple(sent))
+            key = (self.peer_types[g], p, index, self.vectors[g].tobytes(), tuple(sent))
             if key not in self._edges:
                 arguments = [x, u, m[p], sent, self.parameters[g], [Fraction(0)]]
                 self._edges[key] = [Fraction(value) for value in evaluate_exact(edge.function, arguments)[0]]

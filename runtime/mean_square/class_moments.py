@@ -68,7 +68,7 @@ PERFECT = ChannelLaw(0.0, 1.0, 0.0, 0.0, 0.0, 0.0, "uniform", None)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PerTickReception:
-    """The peers of a model with a separate reception at each tick: `rows` lists them by schedule id."""
+    """The peers of a model with a separate reception at each tick: `rows` lists them by class."""
 
     groups: tuple[PeerClass, ...]
     exchange: CommunicationGraph
@@ -80,7 +80,7 @@ class PerTickReception:
 
     def of(self, loop: ModalSystem) -> list[tuple[UncertainSample, ...]]:
         """Return the received sample of each row of r, for each subsystem of a loop."""
-        return [self.rows[id(subsystem.schedule)] for subsystem in loop.subsystems]
+        return [self.rows[subsystem.index] for subsystem in loop.subsystems]
 
 
 def build_reception(
@@ -105,20 +105,20 @@ def build_reception(
     stored = {link.name: 0 for link in system.links}
     schedules = build_schedules(system, timings, patterns, order=numeric.order, stored=stored)
     schedules_per_tick = {
-        (id(schedule), group.peer_type): with_substitutes(schedule, system.peer_types[group.peer_type])
+        (schedule, group.peer_type): with_substitutes(schedule, system.peer_types[group.peer_type])
         if stand_in
         else with_per_tick_inputs(schedule)
         for schedule, group in zip(schedules, system.groups, strict=True)
     }
     by_tick = tuple(
-        schedules_per_tick[id(schedule), group.peer_type]
+        schedules_per_tick[schedule, group.peer_type]
         for schedule, group in zip(schedules, system.groups, strict=True)
     )
-    rows = {id(per_tick): schedule.selected for schedule, per_tick in zip(schedules, by_tick, strict=True)}
     shifted_system = replace(
         system, timings=tuple(replace(timing, value=timings[timing.name]) for timing in system.timings)
     )
     groups, exchange = lifted_groups(replace(numeric, model=shifted_system, given_schedules=by_tick))
+    rows = {group.index: schedules[exchange.group_of(group.peers.first)].selected for group in groups}
     strictly = numeric.order.index("tick") < numeric.order.index("deliver")
     frame, quantum = schedules[0].frame_s, schedules[0].quantum
     return PerTickReception(groups, exchange, rows, timings, frame, quantum, strictly)

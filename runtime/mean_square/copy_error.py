@@ -55,14 +55,14 @@ class PeerReadings:
 
 @dataclass(frozen=True, slots=True)
 class Forced:
-    """The peers of a model with force inputs; `peers` lists the measured rows of z, by schedule id."""
+    """The peers of a model with force inputs; `peers` are the measured rows of z by class."""
 
     reception: PerTickReception
     peers: Mapping[int, PeerReadings]
 
     def of(self, subsystems: Sequence[PeerClass]) -> list[tuple[int, PeerReadings]]:
         """Return the number of peers of each class, and the class's readings."""
-        return [(subsystem.count, self.peers[id(subsystem.schedule)]) for subsystem in subsystems]
+        return [(subsystem.count, self.peers[subsystem.index]) for subsystem in subsystems]
 
     def peer_by_peer(self) -> list[tuple[int, PeerReadings]]:
         """Return the readings of each peer, in the order of peers."""
@@ -96,33 +96,19 @@ def forced(system: Model, reception: PerTickReception, first: Fraction = Fractio
         key=lambda clock: reception.timings[clock.period],
     )
     ticks = instants(reception, fastest)
-    groups, rows, peers = [], {}, {}
-    forced_groups: dict[tuple[int, int], tuple[PeerClass, PeerReadings]] = {}
+    groups: list[PeerClass] = []
+    peers: dict[int, PeerReadings] = {}
     for group in reception.groups:
-        key = id(group.schedule), id(group.lifting)
-        if key not in forced_groups:
-            device = find_device(
-                group.jacobians, group.parameters, unit_of, group.initial_reception, direct=direct
-            )
-            if isinstance(device, str):
-                raise NotSupportedError(device)
-            forced_groups[key] = _forced(group, device, ticks, -first % reception.frame)
-        forced_group, peer = forced_groups[key]
-        groups.append(
-            replace(
-                group,
-                jacobians=forced_group.jacobians,
-                subsystem=forced_group.subsystem,
-                exacting=forced_group.exacting,
-                schedule=forced_group.schedule,
-                lifting=forced_group.lifting,
-            )
+        device = find_device(
+            group.jacobians, group.parameters, unit_of, group.initial_reception, direct=direct
         )
-        rows[id(forced_group.schedule)] = reception.rows.get(id(group.schedule), ())
-        peers[id(forced_group.schedule)] = peer
+        if isinstance(device, str):
+            raise NotSupportedError(device)
+        forced_group, peers[group.index] = _forced(group, device, ticks, -first % reception.frame)
+        groups.append(forced_group)
     if not any(peer.input_slots for peer in peers.values()):
         raise NotSupportedError("no peer has a device besides its object copies")
-    return Forced(replace(reception, groups=tuple(groups), rows=rows), peers)
+    return Forced(replace(reception, groups=tuple(groups)), peers)
 
 
 def _forced(

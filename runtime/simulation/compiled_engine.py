@@ -34,6 +34,7 @@ from apc.simulation.exchange_program import (
     WeightedSum,
 )
 from apc.simulation.population import DeliverySource, FrameRows, Population, PopulationState
+from apc.simulation.program import Segment
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -273,25 +274,23 @@ def _number(value: float) -> str:
 class LoadedLibrary:
     """The loaded library of a population.
 
-    `kernels` are the indices of the segments' kernels by their `id`.
+    `kernels` are the indices of the segments' kernels by segment.
     """
 
     loaded: ctypes.CDLL
-    kernels: Mapping[int, int]
+    kernels: Mapping[Segment, int]
 
 
 def library_of(population: Population) -> LoadedLibrary | None:
     """Return the compiled library of a population, None if unavailable."""
-    segments = {
-        id(segment): (segment, m.program) for m in population.members for segment in m.program.segments
-    }
-    functions = [segment.kernel for segment, _ in segments.values()]
+    segments = {segment: m.program for m in population.members for segment in m.program.segments}
+    functions = [segment.kernel for segment in segments]
     reads = list(population.exchange_program.functions)
     if ctypes.sizeof(ctypes.c_void_p) != 8 or not all(
         _is_compilable(function) for function in (*functions, *reads)
     ):
         return None
-    kernels = [(straight(segment.kernel), len(program.recorded)) for segment, program in segments.values()]
+    kernels = [(straight(segment.kernel), len(program.recorded)) for segment, program in segments.items()]
     many = max(member.count for member in population.members) >= MANY
     loaded = native(program_text(kernels, [straight(reduction) for reduction in reads]), many=many)
     if loaded is None:
@@ -450,7 +449,7 @@ class CompiledEngine(PopulationState):
         population = self.population
         segment = population.members[g].program.segments[index]
         keys = self._keep_integers([population.exchange_program.sent[g][row] for row in segment.sent])
-        location = (library.kernels[id(segment)], segment.first_mark, population.columns[g])
+        location = (library.kernels[segment], segment.first_mark, population.columns[g])
         return self._operation("move", g, *location, segment.first_impulse, p=keys)
 
     def _source_location(self, source: Source) -> tuple[int, int, int]:

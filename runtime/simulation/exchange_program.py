@@ -18,6 +18,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -199,7 +200,7 @@ class _ExchangeBuilder:
             link: np.array([any(send.link == link for send in m.program.peer_type.sends) for m in members])
             for link in exchange.links
         }
-        self.functions: dict[int, tuple[int, object]] = {}
+        self.functions: dict[Any, int] = {}  # casadi.Function
         self.arcs: dict[tuple[int, CouplingTerm, str], _Arcs] = {}
 
     def exchange_program(self) -> ExchangeProgram:
@@ -233,7 +234,7 @@ class _ExchangeBuilder:
                 ])
                 for keys, route in zip(channels, self.routes, strict=True)
             ),
-            functions=tuple(function for _, function in self.functions.values()),
+            functions=tuple(self.functions),
             segments=segments,
         )  # fmt: skip
 
@@ -330,9 +331,7 @@ class _ExchangeBuilder:
             The received rows of the schedule that it reads: for each delay those of all channels, and on an
             unreliable link that of the missing packets.
         """
-        function_index, _ = self.functions.setdefault(
-            id(pairwise.function), (len(self.functions), pairwise.function)
-        )
+        function_index = self.functions.setdefault(pairwise.function, len(self.functions))
         reductions: list[Operation] = []
         for delay in dict.fromkeys(row.coupling_term.delay for row in rows):
             rows_of_delay = [row for row in rows if row.coupling_term.delay == delay]

@@ -326,7 +326,7 @@ def _members(
             peers = np.flatnonzero(mask)
             if not len(peers):
                 continue
-            program_key = (model_group.peer_type, id(schedule), recorded)
+            program_key = (model_group.peer_type, schedule, recorded)
             if program_key not in programs:
                 programs[program_key] = build_program(
                     linear[model_group.peer_type],

@@ -56,7 +56,7 @@ def unprovable(system: ClosedLoop | ModalSystem) -> str:
     """Return the reason why a system has no exact coefficients, "" if its coefficients are exact."""
     if not system.subsystems:
         return "its matrix was not composed from those of peers"
-    for group in {id(group.jacobians): group for group in system.subsystems}.values():
+    for group in {group.index: group for group in system.subsystems}.values():
         functions = [group.jacobians.function, *(edge.function for edge in group.jacobians.edges.values())]
         if not all(function.is_a("SXFunction") for function in functions):
             return f"the equations of {group.name} contain a nonlinear loop, whose solution is rounded"
@@ -81,9 +81,9 @@ def subsystem_balls(system: ClosedLoop | ModalSystem) -> list[LinearSubsystem]:
     converted: dict[int, LinearSubsystem] = {}
     linear_subsystems = []
     for group in system.subsystems:
-        if id(group.subsystem) not in converted:
-            converted[id(group.subsystem)] = entrywise(group.exact, rational_ball)
-        linear_subsystems.append(converted[id(group.subsystem)])
+        if group.index not in converted:
+            converted[group.index] = entrywise(group.exact, rational_ball)
+        linear_subsystems.append(converted[group.index])
     return linear_subsystems
 
 
@@ -103,13 +103,12 @@ def frame_steps(
 def frame_balls(system: ClosedLoop | ModalSystem) -> Balls:
     """Return the closed matrix (n, n) of a system as balls at the current precision."""
     subsystems = subsystem_balls(system)
-    computed: dict[tuple[int, int], Steps] = {}
+    computed: dict[int, Steps] = {}
     steps = []
     for subsystem, group in zip(subsystems, system.subsystems, strict=True):
-        key = (id(subsystem), id(group.schedule))
-        if key not in computed:
-            computed[key] = frame_steps(subsystem, group.schedule)
-        steps.append(computed[key])
+        if group.index not in computed:
+            computed[group.index] = frame_steps(subsystem, group.schedule)
+        steps.append(computed[group.index])
     return closed_frame(system, subsystems, steps)
 
 

@@ -280,7 +280,7 @@ def split_exchangeable(loop: ModalSystem, exchange: CommunicationGraph) -> tuple
 def _are_exchangeable(loop: ModalSystem, g: int, h: int) -> bool:
     """Return whether an exchange of the subsystems g and h leaves the loop unchanged."""
     subsystem, other = loop.subsystems[g], loop.subsystems[h]
-    if subsystem.lifting is not other.lifting or subsystem.schedule is not other.schedule:
+    if subsystem.index != other.index:
         return False
     remaining = [index for index in range(len(loop.subsystems)) if index not in (g, h)]
     return all(

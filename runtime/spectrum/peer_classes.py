@@ -13,9 +13,8 @@ Does not: connect them (see `modes` and `interconnection`).
 from __future__ import annotations
 
 import bisect
-import functools
 import itertools
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Any
@@ -52,9 +51,9 @@ class PeerClass:
     """`count` peers with equal motion; `parameters` is the vector (n_p,) of the first of them.
 
     `peers` are the numbers of these peers in the model, from 0; `delay_class` is the model's group where it
-    has delays of its own (see `CommunicationGraph.delay_class`); `index` is the class's key in `gains`.
-    `exacting` gives `exact`, the subsystem's matrices in rationals, or its floats taken as exact where there
-    are none, and `lifting` gives `lifted`: both are computed on first access.
+    has delays of its own (see `CommunicationGraph.delay_class`); `index` identifies the class in its model,
+    and is its key in `gains`. `exact` are the subsystem's matrices in rationals, or its floats taken as exact
+    where there are none. `frame_map` is None for a class that is only examined for rigid modes.
     """
 
     name: str
@@ -62,9 +61,9 @@ class PeerClass:
     parameters: Floats
     jacobians: SubsystemJacobians
     subsystem: LinearSubsystem
-    exacting: Callable[[], LinearSubsystem]
+    exact: LinearSubsystem
     schedule: Schedule
-    lifting: Callable[[], FrameMap]
+    frame_map: FrameMap | None
     peers: PeerIndices
     delay_class: int
     index: int
@@ -72,14 +71,10 @@ class PeerClass:
     gains: Gains
 
     @property
-    def exact(self) -> LinearSubsystem:
-        """The subsystem's matrices in rationals."""
-        return self.exacting()
-
-    @property
     def lifted(self) -> FrameMap:
         """The map of one frame, with its radii."""
-        return self.lifting()
+        assert self.frame_map is not None, f"{self.name} was not lifted"
+        return self.frame_map
 
     @property
     def z_names(self) -> tuple[str, ...]:
@@ -88,7 +83,7 @@ class PeerClass:
 
     def with_lifted(self, lifted: FrameMap) -> PeerClass:
         """Return the same class of peers with another frame map."""
-        return replace(self, lifting=lambda: lifted)
+        return replace(self, frame_map=lifted)
 
     def sends(self, link: str) -> bool:
         """Return whether these peers send over a link."""
@@ -123,9 +118,9 @@ class PeerClass:
             self,
             jacobians=replace(self.jacobians, peer_type=subsystem.peer_type),
             subsystem=subsystem,
-            exacting=lambda: exact,
+            exact=exact,
             schedule=schedule,
-            lifting=functools.cache(lambda: lifted or lift(subsystem, schedule, exact=exact)),
+            frame_map=lifted or lift(subsystem, schedule, exact=exact),
         )
 
 
@@ -135,49 +130,40 @@ def build_group(
     peers: PeerIndices,
     initial_reception: InitialReception | None = None,
     gains: Gains | None = None,
+    *,
+    lifted: bool = True,
 ) -> PeerClass:
-    """Return peers of equal motion as a class, linearized with the parameters of the first peer.
+    """Return peers of equal motion as a class, linearized with the parameters of the first peer, and lifted.
 
     Parameters
     ----------
     numeric
         The model with its parameter values.
     index
-        The key of the class in `gains`.
+        The index of the class.
     peers
         The peers of the class; the first one represents all.
     initial_reception, gains
         The values received at the start, and the gain for each sender; None for affine equations.
+    lifted
+        Whether the class is lifted.
     """
     exchange = numeric.exchange
     group, vector = exchange.group_of(peers.first), numeric.vector(peers.first)
     jacobians, schedule = numeric.subsystems[group], numeric.schedules[group]
     check_packets(schedule)
     subsystem = linearize(jacobians, vector, initial_reception)
-
-    @functools.cache
-    def make_exact() -> LinearSubsystem:
-        """Return the matrices in exact rationals, cached."""
-        # The functions of a nonlinear loop cannot be evaluated operation by operation.
-        return (
-            linearize_exact(jacobians, vector, initial_reception)
-            if jacobians.walkable
-            else rational_floats(subsystem)
-        )
-
-    def make_lifted() -> FrameMap:
-        """Return the frame map."""
-        return lift(subsystem, schedule, exact=make_exact() if jacobians.walkable else None)
-
+    # The functions of a nonlinear loop cannot be evaluated operation by operation.
+    exact = linearize_exact(jacobians, vector, initial_reception) if jacobians.walkable else None
     return PeerClass(
         name=group_name(peers, exchange),
         count=len(peers),
         parameters=vector,
         jacobians=jacobians,
         subsystem=subsystem,
-        exacting=make_exact,
+        exact=rational_floats(subsystem) if exact is None else exact,
         schedule=schedule,
-        lifting=functools.cache(make_lifted),
+        frame_map=lift(subsystem, schedule, exact=exact) if lifted else None,
         peers=peers,
         delay_class=exchange.delay_class(group),
         index=index,
@@ -339,7 +325,7 @@ def _merged_classes(
     for g, (initial_reception, gains) in enumerate(received):
         key = (
             *(
-                id(start.subsystems[g]),
+                start.peer_types[g],
                 start.exchange.delay_class(start.groups[g]),
                 start.vectors[g].tobytes(),
             ),
@@ -394,6 +380,9 @@ def has_more_states(numeric: NumericModel, states: int) -> bool:
 
 
 def representatives(numeric: NumericModel) -> list[PeerClass]:
-    """Return a class for each group of the model, with the parameters of its first peer."""
+    """Return a class for each group of the model, with the parameters of its first peer, not lifted."""
     runs = itertools.pairwise(numeric.exchange.starts.tolist())
-    return [build_group(numeric, index, PeerIndices((range(*run),))) for index, run in enumerate(runs)]
+    return [
+        build_group(numeric, index, PeerIndices((range(*run),)), lifted=False)
+        for index, run in enumerate(runs)
+    ]

@@ -47,12 +47,11 @@ def count_translations(numeric: NumericModel, populations: Sequence[Heterogeneou
         The peers of the model, by group.
     """
     groups = representatives(numeric)
-    population_of = {id(group): population for group, population in zip(groups, populations, strict=True)}
     total = 0
     for loop in complete_loops(groups, numeric.exchange):
         free = len(find_rigid_modes(loop, with_drifts=False).names)
         if free and not are_common_to_all_peers(
-            loop, [population_of[id(group)] for group in loop.subsystems]
+            loop, [populations[group.index] for group in loop.subsystems]
         ):
             return None
         total += loop.multiplicity * free

@@ -43,7 +43,6 @@ from apc.studies.loop_structure import (
     loop_structure,
     reduced,
     relative_at,
-    subsystem_key,
     with_constant_pivots,
 )
 from apc.timing.communication_graph import CommunicationGraph
@@ -139,7 +138,7 @@ class BatchEvaluator:
     wirings: tuple[LoopStructure, ...]
     durations: Mapping[int, tuple[float, float]]
     tangents: Mapping[str, Any]  # casadi.Function by the peer type's name
-    fixed: Mapping[tuple[int, int], Mapping[int, Matrices]]  # exponentials independent of free parameters
+    fixed: Mapping[int, Mapping[int, Matrices]]  # exponentials independent of free parameters
 
     @property
     def closed(self) -> tuple[ClosedLoop, ...]:
@@ -204,17 +203,17 @@ class BatchEvaluator:
 
         If the parameter is a time, only step durations change.
         """
-        used = {subsystem_key(group) for system in systems for group in system.subsystems}
+        used = {group.index for system in systems for group in system.subsystems}
         at_value = {
-            subsystem_key(group): (vector, linearize_exact(group.jacobians, vector))
+            group.index: (vector, linearize_exact(group.jacobians, vector))
             for group, vector in self._parameters_at(value)
-            if subsystem_key(group) in used
+            if group.index in used
         }
 
         def at_point(group: PeerClass) -> PeerClass:
             """Return a class with the parameters and the exact subsystem of the point."""
-            vector, exact = at_value[subsystem_key(group)]
-            return replace(group, parameters=vector, exacting=lambda: exact)
+            vector, exact = at_value[group.index]
+            return replace(group, parameters=vector, exact=exact)
 
         return tuple(
             replace(system, subsystems=tuple(map(at_point, system.subsystems))) for system in systems
@@ -225,14 +224,12 @@ class BatchEvaluator:
         point = np.array([value], dtype=np.float64)
         return [(group, self.vectors(group, point)[0]) for group in self.groups]
 
-    def lifted(self, values: Matrices) -> dict[tuple[int, int], FrameMap]:
-        """Return the frame maps of all classes by the identities of subsystem and schedule, each
-        built once.
-        """
-        result: dict[tuple[int, int], FrameMap] = {}
+    def lifted(self, values: Matrices) -> dict[int, FrameMap]:
+        """Return the frame maps of all classes by their indices."""
+        result: dict[int, FrameMap] = {}
         for group in self.groups:
-            if subsystem_key(group) not in result:
-                result[subsystem_key(group)] = self._lift(group, values)
+            if group.index not in result:
+                result[group.index] = self._lift(group, values)
         return result
 
     def bounded(self, vectors: Callable[[PeerClass], Floats]) -> tuple[Bounded, ...]:
@@ -244,14 +241,14 @@ class BatchEvaluator:
             The function from a class to its parameters at each point (k, n_p), or (1, n_p) if constant.
         """
         assert not self.timed, "the errors of a step belong to its time"
-        lifts: dict[tuple[int, int], tuple[LinearSubsystem, FrameMap]] = {}
+        lifts: dict[int, tuple[LinearSubsystem, FrameMap]] = {}
         for group in self.groups:
-            if subsystem_key(group) not in lifts:
-                lifts[subsystem_key(group)] = self._lift_bounded(group, vectors(group))
+            if group.index not in lifts:
+                lifts[group.index] = self._lift_bounded(group, vectors(group))
         bounded_systems = []
         for wiring in self.wirings:
             system = wiring.system
-            subsystems, maps = zip(*(lifts[subsystem_key(group)] for group in system.subsystems), strict=True)
+            subsystems, maps = zip(*(lifts[group.index] for group in system.subsystems), strict=True)
             closed = interconnect(maps, wiring.feedback, system.layout, numbers=MIDPOINT_RADIUS)
             complete = value_of(closed.matrix)
             coordinates, is_valid = relative_at(wiring, complete)
@@ -300,10 +297,10 @@ class BatchEvaluator:
         exponentials.
         """
         radius_excess = is_too_large(subsystem.a, subsystem.b)
-        if subsystem_key(group) in self.fixed:
+        if group.index in self.fixed:
             return (
                 replace(subsystem, a=subsystem.a[:1], b=subsystem.b[:1]),
-                self.fixed[subsystem_key(group)],
+                self.fixed[group.index],
                 radius_excess,
             )
         subsystem.a[radius_excess], subsystem.b[radius_excess] = (
@@ -421,30 +418,30 @@ def _generic_point(count: int) -> tuple[Floats, Floats]:
     return 0.5 + np.mod(GENERIC_POINT * indices, 1.0)[None], 0.5 + np.mod(GENERIC_RATIO * indices, 1.0)[None]
 
 
-def _constant_exponentials(evaluator: BatchEvaluator) -> dict[tuple[int, int], Mapping[int, Matrices]]:
+def _constant_exponentials(evaluator: BatchEvaluator) -> dict[int, Mapping[int, Matrices]]:
     """Return the exponentials of the classes whose A and B no free parameter affects."""
     if evaluator.timed:
         return {}
-    result: dict[tuple[int, int], Mapping[int, Matrices]] = {}
+    result: dict[int, Mapping[int, Matrices]] = {}
     point, along = _generic_point(len(evaluator.free))
     for group in evaluator.groups:
-        if subsystem_key(group) in result:
+        if group.index in result:
             continue
         vectors = evaluator.vectors(group, point + (STEP * 1j) * along)
         subsystem = subsystem_of(group.jacobians, evaluator.rows(group.jacobians, vectors))
         if not (np.iscomplexobj(subsystem.a) and (subsystem.a.imag.any() or subsystem.b.imag.any())):
             real = with_roundings(every_matrix(subsystem, np.real))
-            result[subsystem_key(group)] = evaluator.steps(real, point, MIDPOINT_RADIUS)
+            result[group.index] = evaluator.steps(real, point, MIDPOINT_RADIUS)
     return result
 
 
 def lifted_systems(systems: Sequence[Wired]) -> tuple[Wired, ...]:
     """Return systems with their subsystems linearized and lifted at their parameters, each subsystem once."""
-    cached: dict[tuple[int, int], tuple[LinearSubsystem, FrameMap]] = {}
+    cached: dict[int, tuple[LinearSubsystem, FrameMap]] = {}
 
     def lifted(group: PeerClass) -> PeerClass:
         """Return a class with its subsystem and frame map at its parameters."""
-        key, built = subsystem_key(group), group.jacobians
+        key, built = group.index, group.jacobians
         if key not in cached:
             subsystem = linearize(built, group.parameters)
             cached[key] = subsystem, lift(subsystem, group.schedule, exact=group.exact)

@@ -2,7 +2,7 @@
 
 Takes: a `ClosedLoop` at a generic point, and the frame maps of its subsystems at each point.
 Gives: `LoopStructure`, `loop_structure`, `with_constant_pivots`, `closed_loop`, `reduced`, `relative_at`,
-`are_rigid`, `subsystem_key`.
+`are_rigid`.
 Guarantees: the matrices are those of `interconnection.close_loop` in relative coordinates, to rounding; at
 points where the directions are not those of a rigid mode they are NaN.
 Does not: lift a subsystem (see `frame_matrices`).
@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 
 from apc.lifting.lift import FrameMap
 from apc.spectrum.interconnection import ClosedLoop, InterconnectionMatrices, feedback_of, interconnect
-from apc.spectrum.peer_classes import PeerClass
 from apc.spectrum.relative_coordinates import Relative, relative, relative_coordinates, relative_indices
 from apc.spectrum.rigid_modes import RigidModes, find_rigid_modes, rigid_modes_of
 
@@ -47,11 +46,6 @@ class LoopStructure:
     rigid: RigidModes
     relative: Relative
     modes_vary: bool  # the directions, and W, depend on free parameters
-
-
-def subsystem_key(group: PeerClass) -> tuple[int, int]:
-    """Return the key of subsystems with one frame map: the identities of subsystem and schedule."""
-    return id(group.subsystem), id(group.schedule)
 
 
 def loop_structure(system: ClosedLoop) -> LoopStructure:
@@ -107,9 +101,9 @@ def with_constant_pivots(wiring: LoopStructure, rigid_elsewhere: RigidModes) -> 
     return replace(wiring, relative=relative_coordinates(basis, relative_indices(constant)), modes_vary=True)
 
 
-def closed_loop(wiring: LoopStructure, lifted: Mapping[tuple[int, int], FrameMap]) -> Matrices:
+def closed_loop(wiring: LoopStructure, lifted: Mapping[int, FrameMap]) -> Matrices:
     """Return the closed-loop matrices (k, n, n) of one system at all points."""
-    maps = [lifted[subsystem_key(group)] for group in wiring.system.subsystems]
+    maps = [lifted[group.index] for group in wiring.system.subsystems]
     return interconnect(maps, [feedback.plain for feedback in wiring.feedback], wiring.system.layout).matrix
 
 

@@ -332,11 +332,11 @@ def _open_loop(system: Model, closed_loop: ClosedLoop) -> _OpenLoopMatrices:
         a, b = (block_diag(*blocks_of_kind) for blocks_of_kind in zip(*split, strict=True))
         return np.hstack([a, b[:, columns[0]], b[:, columns[1]]])
 
-    steps_by_subsystem = {
-        id(subsystem.subsystem): discretize(subsystem.exact.a, subsystem.exact.b, [period])[0]
+    steps_of_class = {
+        subsystem.index: discretize(subsystem.exact.a, subsystem.exact.b, [period])[0]
         for subsystem in subsystems
     }
-    steps = [steps_by_subsystem[id(subsystem.subsystem)] for subsystem in subsystems]
+    steps = [steps_of_class[subsystem.index] for subsystem in subsystems]
     return _OpenLoopMatrices(
         ratio=ratio,
         period=period,
@@ -572,7 +572,7 @@ def _periods(system: Model, subsystems: Sequence[PeerClass]) -> tuple[Fraction, 
     networks = dict.fromkeys(link_clock[coupling_term.link] for coupling_term in coupling_terms)
     missing = [
         text
-        for group in {id(subsystem.subsystem): subsystem for subsystem in subsystems}.values()
+        for group in {subsystem.index: subsystem for subsystem in subsystems}.values()
         for text in _form_differences(group)
     ]
     for subject, result in (("clock of forces", forces), ("network clock", networks)):

@@ -39,9 +39,9 @@ from apc.spectrum.interconnection import (
     interconnect,
 )
 from apc.spectrum.matrix_norms import balance, norms
+from apc.spectrum.peer_classes import PeerClass
 from apc.spectrum.relative_coordinates import Relative, relative, relative_coordinates, with_uncertainty
 from apc.spectrum.rigid_modes import RigidModes
-from apc.timing.schedule import Schedule
 
 Floats = NDArray[np.float64]
 Truths = NDArray[np.bool_]
@@ -68,13 +68,12 @@ Quotient = tuple[Polynomial, Polynomial | None]
 class ParametricFrames:
     """Subsystems with symbolic parameters, ready to be lifted over cells of a box.
 
-    `texts` are the texts of the symbolic entries by the `id` of the entry; `quotients` are the entries by
-    their texts.
+    `subsystems` are the matrices of each class by its index, with texts as symbolic entries; `quotients` are
+    these entries by their texts. `classes` are the classes in the order of the system.
     """
 
-    subsystems: tuple[LinearSubsystem, ...]
-    schedules: tuple[Schedule, ...]
-    texts: Mapping[int, str]
+    classes: tuple[PeerClass, ...]
+    subsystems: Mapping[int, LinearSubsystem]
     quotients: Mapping[str, Quotient]
 
 
@@ -126,7 +125,7 @@ def parametric_closed_loop(
     """
     return ParametricClosedLoop(
         system,
-        parametric_frames(subsystems, [group.schedule for group in system.subsystems]),
+        parametric_frames(subsystems, system.subsystems),
         tuple(feedback_of(system, system.layout)),
         with_uncertainty(relative_coordinates(rigid.basis)),
         radius,
@@ -134,28 +133,30 @@ def parametric_closed_loop(
 
 
 def parametric_frames(
-    subsystems: Sequence[LinearSubsystem], schedules: Sequence[Schedule]
+    subsystems: Sequence[LinearSubsystem], classes: Sequence[PeerClass]
 ) -> ParametricFrames:
     """Return subsystems with symbolic parameters, ready to be lifted over cells.
 
     Parameters
     ----------
-    subsystems, schedules
-        Their matrices, over `Fraction` and `Ratio`, and the events of their frames.
+    subsystems, classes
+        Their matrices, over `Fraction` and `Ratio`, and their classes at a point of the box.
     """
-    ratios: list[Ratio] = []
+    quotients: dict[str, Quotient] = {}
 
-    def collect(entries: Matrix) -> Matrix:
-        """Append the symbolic entries of a matrix to the list; return the matrix unchanged."""
-        ratios.extend(entry for entry in entries.flat if isinstance(entry, Ratio))
-        return entries
+    def with_texts(entries: Matrix) -> Matrix:
+        """Return a matrix with its symbolic entries replaced by their texts, and keep these entries."""
+        result = entries.copy()
+        for position, entry in np.ndenumerate(entries):
+            if isinstance(entry, Ratio):
+                result[position] = text = f"{entry.top}/{entry.bottom}"
+                if text not in quotients:
+                    quotients[text] = _quotient(entry)
+        return result
 
-    for subsystem in {id(subsystem): subsystem for subsystem in subsystems}.values():
-        every_matrix(subsystem, collect)
-    texts = {id(ratio): f"{ratio.top}/{ratio.bottom}" for ratio in ratios}
-    distinct = {texts[id(ratio)]: ratio for ratio in ratios}
-    quotients = {text: _quotient(ratio) for text, ratio in distinct.items()}
-    return ParametricFrames(tuple(subsystems), tuple(schedules), texts, quotients)
+    first_of_class = {peers.index: subsystem for peers, subsystem in zip(classes, subsystems, strict=True)}
+    symbolic = {index: every_matrix(subsystem, with_texts) for index, subsystem in first_of_class.items()}
+    return ParametricFrames(tuple(classes), symbolic, quotients)
 
 
 def contracted(matrix: Matrix) -> Contraction:
@@ -316,27 +317,25 @@ def frames_over(problem: ParametricFrames, cells: Sequence[Cell]) -> list[FrameM
         """Return a matrix over the cells, (k, 2 + m, rows, columns), from exact and symbolic entries."""
         result = np.zeros((len(cells), 2 + count, *entries.shape))
         for (row, column), entry in np.ndenumerate(entries):
-            if isinstance(entry, Ratio):
-                result[..., row, column] = values[problem.texts[id(entry)]]
+            if isinstance(entry, str):
+                result[..., row, column] = values[entry]
             elif entry:
                 result[:, :2, row, column] = _bounded(Fraction(entry))
         return result
 
-    cached: dict[tuple[int, int], FrameMap] = {}
-    maps = []
-    for subsystem, schedule in zip(problem.subsystems, problem.schedules, strict=True):
-        key = id(subsystem), id(schedule)
-        if key not in cached:
-            linear_subsystem = every_matrix(subsystem, evaluate)
+    maps: dict[int, FrameMap] = {}
+    for peers in problem.classes:
+        if peers.index not in maps:
+            schedule = peers.schedule
+            linear_subsystem = every_matrix(problem.subsystems[peers.index], evaluate)
             steps = {
                 number: exponential(
                     linear_subsystem.a, linear_subsystem.b, float(number * schedule.quantum), arithmetic
                 )
                 for number in step_durations(schedule)
             }
-            cached[key] = compose(linear_subsystem, schedule, steps, numbers=arithmetic)
-        maps.append(cached[key])
-    return maps
+            maps[peers.index] = compose(linear_subsystem, schedule, steps, numbers=arithmetic)
+    return [maps[peers.index] for peers in problem.classes]
 
 
 def _parameters(cells: Sequence[Cell], *, wide: bool) -> list[Matrix]:

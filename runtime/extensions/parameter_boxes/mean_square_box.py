@@ -40,6 +40,7 @@ from apc.lifting.interval_arithmetic import UNIT_ROUNDOFF
 from apc.lifting.lift import FrameMap
 from apc.lifting.numeric_model import NumericModel, numeric_model
 from apc.lifting.taylor_models import hull, within
+from apc.linearization.linear_subsystem import LinearSubsystem
 from apc.mean_square.class_moments import (
     Classes,
     build_reception,
@@ -77,8 +78,9 @@ class _BoxProblem:
     ranges: tuple[Range, ...]
     local: tuple[int, ...]  # the indices of the ranges of peer parameters
     classes: Classes
-    frames: ParametricFrames  # of all groups of peers
-    indices: Mapping[str, int]  # the index in `frames` of each subsystem of a loop, by its name
+    subsystems: tuple[LinearSubsystem, ...]  # of all groups of peers, over `Fraction` and `Ratio`
+    frames: ParametricFrames
+    indices: Mapping[str, int]  # the index in `subsystems` of each subsystem of a loop, by its name
     wide: ModalSystem  # the loop of all classes, with frame maps over the box
     memories: Sequence[RouteMemory]
 
@@ -109,7 +111,7 @@ def prove_mean_square(system: Model, ranges: Sequence[Range], *, cells: int | No
             if not stays_rigid(
                 loop_without_packets,
                 [
-                    problem.frames.subsystems[problem.indices[subsystem.name]]
+                    problem.subsystems[problem.indices[subsystem.name]]
                     for subsystem in loop_without_packets.subsystems
                 ],
             ):
@@ -154,8 +156,8 @@ def _box_problem(system: Model, ranges: Sequence[Range]) -> _BoxProblem:
         _refuse_range(numeric.at(_model_at_point(system, ranges, point)), interval)
     parametric = parametric_subsystems(numeric, [ranges[index] for index in peer_ranges], lifted)
     reception = build_reception(numeric.at(parametric.at))
-    subsystems = [parametric.subsystems[group.name] for group in reception.groups]
-    frames = parametric_frames(subsystems, [group.schedule for group in reception.groups])
+    subsystems = tuple(parametric.subsystems[group.name] for group in reception.groups)
+    frames = parametric_frames(subsystems, reception.groups)
     box = tuple((ranges[index].low, ranges[index].high) for index in peer_ranges)
     maps = [frame_map.mapped(lambda block: hull(block)[0]) for frame_map in frames_over(frames, [box])]
     lifted_wide = [group.with_lifted(frame) for group, frame in zip(reception.groups, maps, strict=True)]
@@ -168,7 +170,9 @@ def _box_problem(system: Model, ranges: Sequence[Range]) -> _BoxProblem:
         )
         for subsystem in classes.common.subsystems
     }
-    return _BoxProblem(numeric, tuple(ranges), peer_ranges, classes, frames, indices, loop_over_box, memories)
+    return _BoxProblem(
+        numeric, tuple(ranges), peer_ranges, classes, subsystems, frames, indices, loop_over_box, memories
+    )
 
 
 def _refuse_range(numeric: NumericModel, interval: Range) -> None:

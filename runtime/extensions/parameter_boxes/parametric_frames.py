@@ -62,9 +62,9 @@ def parametric_models(
     for interval in ranges:
         refuse_channel_number(numeric.model, interval.free, LOCATION)
     subsystems = parametric_subsystems(numeric, ranges, lambda changed: lifted_groups(numeric.at(changed)))
-    by_subsystem = {id(group.subsystem): subsystems.subsystems[group.name] for group in subsystems.groups}
+    subsystem_of_class = {group.index: subsystems.subsystems[group.name] for group in subsystems.groups}
     return [
-        (closed_system, tuple(by_subsystem[id(group.subsystem)] for group in closed_system.subsystems))
+        (closed_system, tuple(subsystem_of_class[group.index] for group in closed_system.subsystems))
         for closed_system in split(subsystems.groups, subsystems.exchange)
     ]
 

@@ -137,10 +137,9 @@ def contact_groups(numeric: NumericModel) -> list[tuple[PeerClass, tuple[SectorN
             )
         if not on[group.peer_type].parameters_suffice:
             raise NotSupportedError(f"a force at {group.name} is nonlinear or depends on individual senders")
-    type_index_of = {id(subsystem_jacobians): type_index for type_index, subsystem_jacobians in enumerate(on)}
     pairs = []
     for peers in peer_groups(numeric.with_jacobians(on)):
-        type_index = type_index_of[id(peers.jacobians)]
+        type_index = system.groups[numeric.exchange.group_of(peers.peers.first)].peer_type
         forces = (
             contact_force(switched[type_index], part, numeric.jacobians[type_index], peers.parameters)
             for part in parts[type_index]
@@ -194,11 +193,11 @@ def lure_plants(numeric: NumericModel) -> list[LurePlant]:
             if force.sector and not force.shares:
                 raise NotSupportedError(force.sector)
         cut_classes.append(_cut_peers(group, forces))
-    cut_by_lifting = {id(item.group.lifting): item for item in cut_classes}
+    cut_of_class = {item.group.index: item for item in cut_classes}
     loops = orthogonal_loops([item.group for item in cut_classes], numeric.exchange, LURE_STATES)
     result = []
     for loop in loops:
-        cut_groups = [cut_by_lifting[id(subsystem.lifting)] for subsystem in loop.subsystems]
+        cut_groups = [cut_of_class[subsystem.index] for subsystem in loop.subsystems]
         size = loop.states + sum(len(cut_classes.ticks) for cut_classes in cut_groups)
         if size > LURE_STATES:
             raise NotSupportedError(f"{size:,} coupled states and contact ticks; the limit is {LURE_STATES}")
