@@ -126,7 +126,12 @@ def pairs_of_eigenvalues(matrix: Matrix, values: Complexes) -> Eigenpairs:
         return Eigenpairs(values, result.right[:, :0], result.left[:0])
     distances = np.abs(values[:, None] - result.values)
     nearest = distances.argmin(axis=1)
-    if len(np.unique(nearest)) < len(values):  # two values have the same nearest one
+    taken, first = np.unique(nearest, return_index=True)
+    repeated = np.delete(np.arange(len(values)), first)  # with the same nearest eigenvalue as another value
+    if (np.abs(values[repeated]) < SMALL).all():  # in a defective cluster at zero, whose vectors are arbitrary
+        others = np.delete(np.arange(len(matrix)), taken)
+        nearest[repeated] = others[np.abs(result.values[others]).argsort()[: len(repeated)]]
+    else:
         nearest = load_pool("scipy.optimize").linear_sum_assignment(distances)[1]
     return Eigenpairs(values, result.right[:, nearest], result.left[nearest])
 
