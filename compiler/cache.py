@@ -1,6 +1,6 @@
 """Check whether a compiled model on disk is up to date with its texts.
 
-Takes: the path of a NAME.apc. Gives: `Origin`, the sources of a model, `origin_of`, `replayable`;
+Takes: the path of a NAME.apc. Gives: `Origin`, the sources of a model, `origin_of`, `stored_contents`;
 `Archive`, the parts of a file, `packed`, `read_archive`; `changed`, the first text that differs now;
 `builtin_files`, `program_digest`.
 Guarantees: the decision depends on contents only, not on modification times, and imports no algebra. A model
@@ -178,7 +178,7 @@ def origin_of(topology: Path, read: Mapping[str, bytes]) -> Origin:
     topology
         The file of the topology.
     read
-        The contents of the files by path, from `files.recorded`.
+        The contents of the files by path, from `FileReader`.
     """
     names = {str(path): name for name, path in builtin_files().items()} | {str(topology): topology.name}
     texts = {names.get(path) or _relative_name(path, topology.parent): text for path, text in read.items()}
@@ -193,8 +193,8 @@ def _relative_name(path: str, folder: Path) -> str:
     return f"./{plain.relative_to(folder).as_posix()}{'/' * path.endswith('/')}"
 
 
-def replayable(origin: Origin, folder: Path) -> dict[str, bytes]:
-    """Return the texts of a model and of the built-in library by absolute path, for `files.replayed`.
+def stored_contents(origin: Origin, folder: Path) -> dict[str, bytes]:
+    """Return the texts of a model and of the built-in library by absolute path, for `FileReader`.
 
     Parameters
     ----------

@@ -12,14 +12,14 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Literal
 
-from apc.compiler.cache import Origin, origin_of, replayable
+from apc.compiler.cache import Origin, origin_of, stored_contents
 from apc.compiler.compiled import Model
 from apc.compiler.components.component_library import Library, definition_of
 from apc.compiler.equations.causalization import SortedSystem, sort
 from apc.compiler.equations.clocks import ClockedSystem, check_single, partition
 from apc.compiler.equations.flatten import FlatSystem, flatten
 from apc.compiler.errors import ApcError, Mistakes, SourceLocation
-from apc.compiler.files import recorded, replayed
+from apc.compiler.files import FileReader
 from apc.compiler.functions.functions import build_functions
 from apc.compiler.source.source import Source, read_source
 from apc.compiler.timings import part
@@ -29,9 +29,9 @@ Stage = Literal["source", "topology", "flat", "clocked", "sorted", "compiled"]
 StageValue = Source | Topology | FlatSystem | ClockedSystem | SortedSystem | Model
 
 
-def compile_topology(path: Path) -> Model:
+def compile_topology(path: Path, reader: FileReader | None = None) -> Model:
     """Return the compiled model of a topology file. Raises ApcError with all mistakes of the topology."""
-    value = run_stages(path, until="compiled")
+    value = run_stages(path, until="compiled", reader=reader)
     assert isinstance(value, Model)
     return value
 
@@ -51,8 +51,8 @@ def compile_again(origin: Origin, folder: Path) -> Model:
     ApcError
         The texts have errors.
     """
-    with replayed(replayable(origin, folder)):
-        return compile_topology(folder / origin.topology)
+    reader = FileReader(stored=stored_contents(origin, folder))
+    return compile_topology(folder / origin.topology, reader)
 
 
 def check_definition(path: Path) -> str:
@@ -93,43 +93,40 @@ def linear_system(topology: Topology) -> SortedSystem | None:
     return sort(partition(flatten(topology, linear=True)))
 
 
-def run_stages(path: Path, *, until: Stage) -> StageValue:
+def run_stages(path: Path, *, until: Stage, reader: FileReader | None = None) -> StageValue:
     """Return the result of the stage `until`. Raises ApcError with the mistakes of the stage that fails."""
-    return next(value for stage, value in each_stage(path) if stage == until)
+    return next(value for stage, value in each_stage(path, reader) if stage == until)
 
 
-def each_stage(path: Path) -> Iterator[tuple[Stage, StageValue]]:
+def each_stage(path: Path, reader: FileReader | None = None) -> Iterator[tuple[Stage, StageValue]]:
     """Run the stages in sequence; yield the name and the result of each stage."""
-    texts: dict[str, bytes] = {}
-    with part("source"), recorded(texts):
-        source = read_source(path)
-    yield from stages_of(source, texts)
+    with part("source"):
+        source = read_source(path, reader)
+    yield from stages_of(source)
 
 
-def stages_of(source: Source, texts: dict[str, bytes] | None = None) -> Iterator[tuple[Stage, StageValue]]:
+def stages_of(source: Source) -> Iterator[tuple[Stage, StageValue]]:
     """Run the stages in sequence on a source with a path; yield the name and the result of each stage.
 
     Parameters
     ----------
     source
         The topology.
-    texts
-        The contents of the files read so far, by path; the files read by the stages are added.
     """
     assert source.path is not None
-    path, texts = source.path, {} if texts is None else texts
+    path, reader = source.path, source.reader
     steps: dict[Stage, Callable[[Any], StageValue]] = {
-        "topology": lambda source: build_topology(source, Library(library_folders(source))),
+        "topology": lambda source: build_topology(source, Library(library_folders(source), reader=reader)),
         "flat": flatten,
         "clocked": partition,
         "sorted": sort,
         "compiled": lambda ordered: build_functions(
-            ordered, origin_of(path, texts), linear=linear_system(ordered.topology)
+            ordered, origin_of(path, reader.contents), linear=linear_system(ordered.topology)
         ),
     }
     value: StageValue = source
     yield "source", value
     for stage, step in steps.items():
-        with part(stage), recorded(texts):
+        with part(stage):
             value = step(value)
         yield stage, value

@@ -18,7 +18,7 @@ from apc.compiler.cache import SUFFIX, builtin_files
 from apc.compiler.components.component import Component, Connector
 from apc.compiler.components.definitions import read_component, read_connector
 from apc.compiler.errors import ApcError, Diagnostic
-from apc.compiler.files import RefusedError, files_below, read_file, same_file
+from apc.compiler.files import FileReader, RefusedError, same_file
 from apc.compiler.source.nodes import MAX_BYTES, Mapping, Scalar
 from apc.compiler.source.reading import brief, fault
 from apc.compiler.source.source import Source, read_source
@@ -36,14 +36,20 @@ class Library:
     be read raises ApcError; with the list `aside`, the error is added to this list.
     """
 
-    def __init__(self, folders: tuple[Path, ...] = (), aside: list[ApcError] | None = None) -> None:
+    def __init__(
+        self,
+        folders: tuple[Path, ...] = (),
+        aside: list[ApcError] | None = None,
+        reader: FileReader | None = None,
+    ) -> None:
+        self._reader = reader or FileReader()
         self._sources: dict[str, Source] = {}
         self._read: dict[str, Any] = {}  # components, connectors, or the error of an invalid definition
         self._open: list[str] = []  # the components being read, from outer to inner
         local: dict[str, Path] = {}
-        for path in (path for folder in folders for path in files_below(folder, SUFFIX)):
+        for path in (path for folder in folders for path in self._reader.files_below(folder, SUFFIX)):
             try:
-                source = _read_user_file(path)
+                source = _read_user_file(path, self._reader)
             except ApcError as error:
                 if aside is None:
                     raise
@@ -116,21 +122,21 @@ class Library:
         """Return the source of a definition, read on first use."""
         if name not in self._sources:
             path = self.files[name]
-            self._sources[name] = read_source(path, shown=path.name)
+            self._sources[name] = read_source(path, self._reader, shown=path.name)
         return self._sources[name]
 
 
-def _read_user_file(path: Path) -> Source:
+def _read_user_file(path: Path, reader: FileReader) -> Source:
     """Return the source of a file in a user's folder.
 
     The error for a file without a component or connector contains no text of the file.
     """
     try:
-        return read_source(path)
+        return read_source(path, reader)
     except ApcError as error:
         text = b"component"  # the reason contains nothing of the file's text
         with suppress(RefusedError):
-            text = read_file(path, MAX_BYTES)
+            text = reader.read(path, MAX_BYTES)
         if b"component" in text or b"connector" in text:
             raise
         message, expected = "a file of a library", "YAML that defines a component or connector"

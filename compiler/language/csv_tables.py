@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.errors import ApcError, Mistakes, SourceLocation
-from apc.compiler.files import RefusedError, read_file
+from apc.compiler.files import FileReader, InputFile, RefusedError
 from apc.compiler.language.units import NO_UNIT, Unit, parse_unit
 from apc.compiler.number_parsing import plain_float
 from apc.compiler.source.reading import brief, fault
@@ -47,18 +47,17 @@ F = TypeVar("F")
 
 @dataclass(frozen=True, slots=True)
 class NamedFiles:
-    """The reader of the files named by a topology: their `folder`, the `names` of the files read, and all
-    `mistakes`.
-    """
+    """The files that a topology names: their `folder`, the `names` of the files read, and all `mistakes`."""
 
     folder: Path
     mistakes: Mistakes
+    reader: FileReader
     names: set[str] = field(default_factory=set)
 
-    def read(self, name: str, reader: Callable[[Path], F]) -> F | None:
-        """Return the result of `reader` for a file; None if the file is invalid, with its errors recorded."""
+    def read(self, name: str, read: Callable[[InputFile], F]) -> F | None:
+        """Return the result of `read` for a file; None if the file is invalid, with its errors recorded."""
         with self.mistakes:
-            result = reader(self.folder / name)
+            result = read(InputFile(self.folder / name, self.reader))
             self.names.add(name)
             return result
         return None
@@ -88,12 +87,12 @@ class Table:
         return len(self.columns[0].numbers) if self.columns else 0
 
 
-def read_table(path: Path, named_at: SourceLocation) -> Table:
+def read_table(file: InputFile, named_at: SourceLocation) -> Table:
     """Return the table in a CSV file of numbers below headings such as `device.mass [kg]`.
 
     Parameters
     ----------
-    path
+    file
         The file.
     named_at
         The location of its reference, for a file that cannot be read.
@@ -103,7 +102,7 @@ def read_table(path: Path, named_at: SourceLocation) -> Table:
     ApcError
         E701 the file cannot be read, E702 a heading is invalid, E703 a row or cell is invalid.
     """
-    with open_table(path, named_at) as opened:
+    with open_table(file, named_at) as opened:
         headings = opened.headings
         cells, lines = opened.numbers(
             range(len(headings)), [plain_float] * len(headings), "cell", "a finite number"
@@ -183,13 +182,13 @@ class CsvReader:
 
 @contextmanager
 def open_table(
-    path: Path, named_at: SourceLocation, known: Collection[str] = (), example: str = _EXAMPLE
+    file: InputFile, named_at: SourceLocation, known: Collection[str] = (), example: str = _EXAMPLE
 ) -> Iterator[CsvReader]:
     """Open a CSV file, read its headings, and yield a reader of its rows.
 
     Parameters
     ----------
-    path, named_at
+    file, named_at
         As for `read_table`.
     known
         Names that are valid headings without a unit.
@@ -203,20 +202,19 @@ def open_table(
         `with` body are raised unchanged, except for a file that does not begin as a table: the only error is
         E702, as its text may be private.
     """
-    data = read_bytes(path, named_at)
-    file = str(path)
+    data, name = read_bytes(file, named_at), str(file.path)
     rows = csv.reader(io.TextIOWrapper(io.BytesIO(data), encoding="utf-8-sig"))
     first: list[str] = []
     try:
         first = next(rows, [])
-        yield CsvReader(file, _headings(first, file, example), rows)
+        yield CsvReader(name, _headings(first, name, example), rows)
     except csv.Error as error:
-        raise fault("E703", SourceLocation(file, rows.line_num or 1, 1), f"invalid CSV: {error}") from None
+        raise fault("E703", SourceLocation(name, rows.line_num or 1, 1), f"invalid CSV: {error}") from None
     except ApcError:
         if not any(map(str.strip, first)) or _is_table(first, known):
             raise
         expected = "a name and its unit in each heading"
-        raise fault("E702", SourceLocation(file, 1, 1), "table", expected, fix=example) from None
+        raise fault("E702", SourceLocation(name, 1, 1), "table", expected, fix=example) from None
 
 
 def _is_table(headings: list[str], texts: Collection[str]) -> bool:
@@ -227,7 +225,7 @@ def _is_table(headings: list[str], texts: Collection[str]) -> bool:
     )
 
 
-def read_bytes(path: Path, named_at: SourceLocation, *, any_text: bool = False) -> bytes:
+def read_bytes(file: InputFile, named_at: SourceLocation, *, any_text: bool = False) -> bytes:
     """Return the bytes of a file, decompressed if its suffix is .gz.
 
     Raises
@@ -236,8 +234,8 @@ def read_bytes(path: Path, named_at: SourceLocation, *, any_text: bool = False) 
         E701 the file cannot be read, or is not UTF-8 text, unless `any_text`.
     """
     try:
-        data = read_file(path, MAX_BYTES)
-        if path.suffix.lower() == PACKED:
+        data = file.read(MAX_BYTES)
+        if file.path.suffix.lower() == PACKED:
             with gzip.open(io.BytesIO(data)) as packed:
                 data = packed.read(MAX_BYTES + 1)
         if len(data) <= MAX_BYTES:
@@ -245,13 +243,13 @@ def read_bytes(path: Path, named_at: SourceLocation, *, any_text: bool = False) 
                 # At once, so that the offset in an error is from the start of the file.
                 data.decode("utf-8-sig")
             return data
-        message = f"{path.name} is larger than {MAX_BYTES >> 20} MiB when unpacked"
+        message = f"{file.path.name} is larger than {MAX_BYTES >> 20} MiB when unpacked"
     except RefusedError as refused:
-        message = f"the table {path} {refused.words}"
+        message = f"the table {file.path} {refused.words}"
     except UnicodeDecodeError as error:
-        message = f"{path.name} is not UTF-8 text (byte {error.start})"
+        message = f"{file.path.name} is not UTF-8 text (byte {error.start})"
     except (OSError, EOFError, zlib.error):
-        message = f"{path.name} is not a complete gzip file"
+        message = f"{file.path.name} is not a complete gzip file"
     raise fault("E701", named_at, message)
 
 

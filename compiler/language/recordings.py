@@ -11,12 +11,12 @@ from __future__ import annotations
 import math
 from codecs import BOM_UTF16_BE, BOM_UTF16_LE
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.errors import SourceLocation
+from apc.compiler.files import InputFile
 from apc.compiler.language.csv_tables import Headings, open_table, read_bytes, read_table
 from apc.compiler.language.dimensions import SECOND
 from apc.compiler.language.ping_recordings import LATEST_DELAY, read_probe
@@ -39,12 +39,12 @@ class TimeTable:
     numbers: NDArray[np.float64]
 
 
-def read_time_table(path: Path, name: str, unit: Unit, named_at: SourceLocation) -> TimeTable:
+def read_time_table(file: InputFile, name: str, unit: Unit, named_at: SourceLocation) -> TimeTable:
     """Return the time series in a CSV file with two columns, time and the quantity, and at least two rows.
 
     Parameters
     ----------
-    path
+    file
         The CSV file.
     name, unit
         The name of the quantity, and a unit of its dimension.
@@ -56,7 +56,7 @@ def read_time_table(path: Path, name: str, unit: Unit, named_at: SourceLocation)
     ApcError
         As `read_table`; E702 other columns or units, E703 fewer than two rows, or times that do not increase.
     """
-    table = read_table(path, named_at)
+    table = read_table(file, named_at)
     first = table.columns[0]
     if len(table.columns) != 2 or first.unit.dimension != SECOND:
         expected = f"two columns, time [s] and {name} [{unit.text}]"
@@ -83,7 +83,7 @@ class Trace:
     interval: float = math.nan
 
 
-def read_trace(path: Path, named_at: SourceLocation) -> Trace:
+def read_trace(file: InputFile, named_at: SourceLocation) -> Trace:
     """Return the delays of packets from the column `delay` of a CSV file, or from output of ping or irtt.
 
     A cell is a delay of 0 or more, or `lost` or empty for a lost packet. Other columns are ignored. An empty
@@ -91,7 +91,7 @@ def read_trace(path: Path, named_at: SourceLocation) -> Trace:
 
     Parameters
     ----------
-    path
+    file
         The CSV file.
     named_at
         The location of its reference in the topology, for a file that can't be read.
@@ -102,16 +102,16 @@ def read_trace(path: Path, named_at: SourceLocation) -> Trace:
         E701 the file cannot be read, E702 there is no column `delay` in a unit of time, E703 a row or cell is
         invalid, or there is no row; E704 a recording of ping or irtt is inconsistent, or has two runs.
     """
-    if path.suffix.lower() != TABLE_SUFFIX:
-        data = read_bytes(path, named_at, any_text=True)
+    if file.path.suffix.lower() != TABLE_SUFFIX:
+        data = read_bytes(file, named_at, any_text=True)
         # Windows writes UTF-16 from PowerShell, else a code page in which digits are encoded as in ASCII.
         encoding = "utf-16" if data[:2] in (BOM_UTF16_LE, BOM_UTF16_BE) else "utf-8-sig"
         text = data.decode(encoding, "replace")
-        if (probe := read_probe(text, str(path))) is not None:
+        if (probe := read_probe(text, str(file.path))) is not None:
             return Trace(probe.delays, probe.program, probe.interval)
         if DELAY not in text.partition("\n")[0]:
-            raise fault("E702", SourceLocation(str(path), 1, 1), "recording", RECORDINGS)
-    with open_table(path, named_at, known=(DELAY,), example="delay [ms]") as opened:
+            raise fault("E702", SourceLocation(str(file.path), 1, 1), "recording", RECORDINGS)
+    with open_table(file, named_at, known=(DELAY,), example="delay [ms]") as opened:
         column = _delay_column(opened.headings)
         scale = float(opened.headings[column][1].scale)
 

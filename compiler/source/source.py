@@ -10,32 +10,35 @@ from __future__ import annotations
 
 import re
 import unicodedata
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation, nearest
-from apc.compiler.files import RefusedError, read_file
+from apc.compiler.files import FileReader, RefusedError
 from apc.compiler.source.compose import compose
 from apc.compiler.source.nodes import MAX_BYTES, Lines, Node
 
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """A text with its tree of nodes: `file` is its name in messages."""
+    """A text with its tree of nodes: `file` is its name in messages, `reader` reads files that it names."""
 
     file: str
     path: Path | None
     text: str
     root: Node
+    reader: FileReader = field(default_factory=FileReader)
 
 
-def read_source(path: Path, *, shown: str | None = None) -> Source:
+def read_source(path: Path, reader: FileReader | None = None, *, shown: str | None = None) -> Source:
     """Return the text and nodes of a YAML file.
 
     Parameters
     ----------
     path
         The file.
+    reader
+        The reader of the compilation; by default a new one.
     shown
         The name of the file in messages; by default the path.
 
@@ -45,12 +48,12 @@ def read_source(path: Path, *, shown: str | None = None) -> Source:
         E101 a missing file, E102 a folder, E103 an unreadable file, E104 not a regular file;
         and the errors of `parse_source`.
     """
-    file = str(path) if shown is None else shown
+    file, reader = str(path) if shown is None else shown, reader or FileReader()
     try:
-        data = read_file(path, MAX_BYTES)
+        data = reader.read(path, MAX_BYTES)
     except RefusedError as refused:
         raise ApcError(_not_read(path, SourceLocation(file), refused)) from None
-    return parse_source(data, file=file, path=path)
+    return replace(parse_source(data, file=file, path=path), reader=reader)
 
 
 def _not_read(path: Path, location: SourceLocation, refused: RefusedError) -> Diagnostic:

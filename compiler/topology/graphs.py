@@ -12,12 +12,12 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 
 from apc.compiler.compiled import MOST_PLACED, Graph
 from apc.compiler.errors import Mistakes, SourceLocation
+from apc.compiler.files import InputFile
 from apc.compiler.language.csv_tables import open_table
 from apc.compiler.language.dimensions import SECOND
 from apc.compiler.language.values import AlreadyReportedError, ScalarValue
@@ -112,7 +112,7 @@ def read_graph(node: Node, numbers: NamedNumbers) -> Graph:
     return Graph("arcs", np.array([*result], np.int64).reshape(-1, 2), np.array([*result.values()]))
 
 
-def _read_pairs(path: Path, named_at: SourceLocation, numbered: Mapping[str, int]) -> tuple[Node, ...]:
+def _read_pairs(file: InputFile, named_at: SourceLocation, numbered: Mapping[str, int]) -> tuple[Node, ...]:
     """Return the rows of a table of pairs as YAML nodes `[from, to]` or `[from, to, weight]`.
 
     A peer is written by its number or by its name, as in YAML; `numbered` has the index of each. Raises
@@ -124,7 +124,7 @@ def _read_pairs(path: Path, named_at: SourceLocation, numbered: Mapping[str, int
         number = numbered.get(text.strip())
         return plain_float(text) if number is None else number + 1
 
-    with open_table(path, named_at) as opened:
+    with open_table(file, named_at) as opened:
         names, location = [name for name, _, _ in opened.headings], opened.headings[0][2]
         if names not in (["from", "to"], ["from", "to", "weight"]):
             expected = "the headings from, to and, optionally, weight"

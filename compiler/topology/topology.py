@@ -22,7 +22,7 @@ from apc.compiler.components.component import Named
 from apc.compiler.components.component_library import Library, definition_of
 from apc.compiler.components.parts import EntryScope, PartEntries
 from apc.compiler.errors import Diagnostic, Mistakes, SourceLocation, visible
-from apc.compiler.files import RefusedError, files_below
+from apc.compiler.files import FileReader, RefusedError
 from apc.compiler.language.csv_tables import NamedFiles
 from apc.compiler.language.values import AlreadyReportedError, ScalarValue
 from apc.compiler.source.nodes import Mapping, Scalar, Sequence
@@ -107,20 +107,26 @@ def library_folders(source: Source) -> tuple[Path, ...]:
     for item in node.items if isinstance(node, Sequence) else () if node is None else (node,):
         with mistakes:
             text = text_of(item, "library", "library: ./parts")
-            paths.append(readable_library(_folder_of(source) / text, text, item.location))
+            paths.append(readable_library(_folder_of(source) / text, source.reader, text, item.location))
     mistakes.raise_if_any()
     return tuple(paths)
 
 
 def readable_library(
-    folder: Path, text: str, location: SourceLocation, *, key: str = "library:", example: str = "./parts"
+    folder: Path,
+    reader: FileReader,
+    text: str,
+    location: SourceLocation,
+    *,
+    key: str = "library:",
+    example: str = "./parts",
 ) -> Path:
     """Return the folder of components after checking that it can be read.
 
     Parameters
     ----------
-    folder, text
-        The folder, and its name as written.
+    folder, reader, text
+        The folder, the reader of the compilation, and the folder's name as written.
     location
         The place of the name.
     key, example
@@ -132,7 +138,7 @@ def readable_library(
         E214 the folder cannot be read.
     """
     try:
-        files_below(folder, SUFFIX)
+        reader.files_below(folder, SUFFIX)
     except RefusedError as refused:
         message = f"the library folder {brief(text)} {refused.words}"
         fix = f"{key} {example}" if refused.why == "large" else ""
@@ -156,7 +162,7 @@ def build_topology(source: Source, library: Library) -> Topology:
     A section is read after the sections whose names it can refer to.
     """
     mistakes = Mistakes()
-    files = NamedFiles(_folder_of(source), mistakes)
+    files = NamedFiles(_folder_of(source), mistakes, source.reader)
     node = mapping_of(source.root, "topology", "topology: my-topology")
     peer_type, name = definition_of(source)
     if peer_type:

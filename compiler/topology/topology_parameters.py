@@ -17,6 +17,7 @@ from pathlib import Path
 
 from apc.compiler.components.component import RESERVED, ComponentVariable, NumberParameter, Settable
 from apc.compiler.errors import Mistakes
+from apc.compiler.files import FileReader
 from apc.compiler.language.csv_tables import NamedFiles
 from apc.compiler.language.dimensions import DIMENSIONLESS, SECOND, Dimension
 from apc.compiler.language.expression import names
@@ -79,7 +80,7 @@ def read_count_by_names(node: Scalar, root: MappingReader) -> ScalarValue:
     ApcError
         E208 the expression names an unknown number, or depends on the number of all peers.
     """
-    numbers = read_named_numbers(root, {"": 1}, NamedFiles(Path(), Mistakes()))
+    numbers = read_named_numbers(root, {"": 1}, NamedFiles(Path(), Mistakes(), FileReader()))
     known = {*numbers.names, *numbers.faulty}
     if unknown := [word for word in _WORD.findall(node.text) if word not in known]:
         expected = "a whole number, or an expression in dimensionless parameters"

@@ -38,16 +38,15 @@ def library_command(
     with units, defaults and limits, its source, and its definition.
     """
     from apc.compiler.components.component_library import Library
+    from apc.compiler.files import FileReader
     from apc.compiler.topology.topology import readable_library
     from apc.compiler.view import catalogue
 
+    reader, option = FileReader(), SourceLocation("--folder")
     local = () if folder is None else (folder,)
-    library = Library(
-        tuple(
-            readable_library(path, str(path), SourceLocation("--folder"), key="--folder", example="parts")
-            for path in local
-        )
-    )
+    for path in local:
+        readable_library(path, reader, str(path), option, key="--folder", example="parts")
+    library = Library(local, reader=reader)
     if name is None:
         document, lines = catalogue.library_document(library), catalogue.library_lines(library)
         echo(json_text(document) if as_json else "\n".join(lines))

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.errors import SourceLocation
+from apc.compiler.files import FileReader, InputFile
 from apc.compiler.language.ping_recordings import HALVED
 from apc.compiler.language.recordings import read_trace
 from apc.network.channel import LATEST, deviates
@@ -125,7 +126,7 @@ def fit_recording(path: str | Path, interval: float | None = None) -> LinkFit:
     ApcError
         E701 to E703, as for a link's `trace`.
     """
-    trace = read_trace(Path(path), SourceLocation(str(path)))
+    trace = read_trace(InputFile(Path(path), FileReader()), SourceLocation(str(path)))
     sending_interval = trace.interval if interval is None else interval
     return fit_delays(trace.delays, str(path), program=trace.program, interval=sending_interval)
 

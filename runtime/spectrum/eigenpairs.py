@@ -128,7 +128,7 @@ def pairs_of_eigenvalues(matrix: Matrix, values: Complexes) -> Eigenpairs:
     nearest = distances.argmin(axis=1)
     taken, first = np.unique(nearest, return_index=True)
     repeated = np.delete(np.arange(len(values)), first)  # with the same nearest eigenvalue as another value
-    if (np.abs(values[repeated]) < SMALL).all():  # in a defective cluster at zero, whose vectors are arbitrary
+    if (np.abs(values[repeated]) < SMALL).all():  # a defective cluster at zero: vectors are arbitrary
         others = np.delete(np.arange(len(matrix)), taken)
         nearest[repeated] = others[np.abs(result.values[others]).argsort()[: len(repeated)]]
     else:

@@ -19,6 +19,8 @@ import pytest
 
 import apc
 from apc.__main__ import run
+from apc.compiler.files import read_file
+from apc.compiler.pipeline import compile_again, compile_topology
 from tests.library.parts import listed, values
 from tests.topologies import AVERAGE, MESH, ONE_MASS, TOPOLOGIES, compiled, library, replaced
 
@@ -410,3 +412,21 @@ def test_a_model_holds_every_text_it_was_made_from_and_no_other() -> None:
     digests = dict(origin.digests)
     assert digests.keys() == {*texts, "apc"}
     assert digests["Mass"] == hashlib.sha256(texts["Mass"]).hexdigest()
+
+
+def test_a_file_is_read_once_and_none_for_stored_texts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("users-table.yaml", "users.csv"):
+        (tmp_path / name).write_bytes((TOPOLOGIES / name).read_bytes())
+    read: list[str] = []
+    monkeypatch.setattr(
+        "apc.compiler.files.read_file",
+        lambda path, most, original=read_file: read.append(str(path)) or original(path, most),
+    )
+    model = compile_topology(tmp_path / "users-table.yaml")
+    assert len(read) == len(set(read)) and str(tmp_path / "users.csv") in read
+    read.clear()
+    (tmp_path / "users.csv").unlink()
+    again = compile_again(model.origin, tmp_path)
+    assert not read and again.groups[0].columns[0].name == model.groups[0].columns[0].name
