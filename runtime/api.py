@@ -8,8 +8,10 @@ Does not: print.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
-from numbers import Integral, Real
+from fractions import Fraction
+from numbers import Rational, Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -147,26 +149,36 @@ def set_parameters(model: Model, values: Mapping[str, str | float]) -> Model:
     ApcError
         A name is unknown, a unit is wrong, or a value is outside its bounds.
     """
-    from apc.parameter_values.overrides import apply, parse_override
+    from apc.parameter_values.overrides import Override, apply, parse_override
+    from apc.parameter_values.parameter_names import OVERRIDE, find
 
     overrides = [
-        parse_override(model, f"{name}={_quantity(model, name, value)}") for name, value in values.items()
+        parse_override(model, f"{name}={value}")
+        if isinstance(value, str)
+        else Override(find(model, name, OVERRIDE, counts=True), _si_number(name, value))
+        for name, value in values.items()
     ]
     return apply(model, overrides)
 
 
+def _si_number(name: str, value: float) -> Fraction:
+    """Return a number in SI exactly; a float is the shortest decimal that rounds to it."""
+    if not isinstance(value, Real) or isinstance(value, bool) or not math.isfinite(value):
+        raise ApcError(
+            Diagnostic("E204", SourceLocation(name), name, "a quantity or an SI number", repr(value)[:80])
+        )
+    return Fraction(value) if isinstance(value, Rational) else Fraction(repr(float(value)))
+
+
 def _quantity(system: Model, name: str, value: str | float) -> str:
-    """Return a parameter value as text; a number is in SI units."""
+    """Return a quantity as text; a number is in SI units."""
     if isinstance(value, str):
         return value
     from apc.parameter_values.parameter_names import find, unit_of
 
-    if not isinstance(value, Real) or isinstance(value, bool):
-        raise ApcError(
-            Diagnostic("E204", SourceLocation(name), name, "a quantity or an SI number", repr(value)[:80])
-        )
-    number = int(value) if isinstance(value, Integral) else float(value)
-    return f"{number!r} {unit_of(system, find(system, name, counts=True).name)}".rstrip()
+    number = _si_number(name, value)
+    shown = number.numerator if number.denominator == 1 else float(number)
+    return f"{shown!r} {unit_of(system, find(system, name, counts=True).name)}".rstrip()
 
 
 def _range(system: Model, name: str, value: str | Sequence[str | float]) -> str:
@@ -280,7 +292,10 @@ def critical(
     from apc.studies import critical_values
 
     system = _model(model, params)
-    low, high = (None if item is None else _quantity(system, parameter, item) for item in (lower, upper))
+    low, high = (
+        item if item is None or isinstance(item, str) else _si_number(parameter, item)
+        for item in (lower, upper)
+    )
     return critical_values.critical(system, parameter, lower=low, upper=high, criterion=criterion)
 
 

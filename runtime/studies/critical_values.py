@@ -185,8 +185,8 @@ def critical(
     system: Model,
     name: str,
     *,
-    lower: str | None = None,
-    upper: str | None = None,
+    lower: str | Fraction | None = None,
+    upper: str | Fraction | None = None,
     criterion: str | None = None,
     progress: Progress | None = None,
 ) -> Critical:
@@ -199,9 +199,9 @@ def critical(
     name
         The parameter or delay, of one group or of all (see `parameter_names.find`).
     lower, upper
-        The limits of the search as quantities, such as "5000 N/m". The default of `lower` is the minimum of
-        the parameter, or 0 (for a negative value, `SPAN` times the value); the default of `upper` is `SPAN`
-        times the present value (for a delay, the end by `parameter_path.delay_reach`).
+        The limits of the search, as quantities such as "5000 N/m" or in SI units. The default of `lower` is
+        the minimum of the parameter, or 0 (for a negative value, `SPAN` times the value); the default of
+        `upper` is `SPAN` times the present value (for a delay, the end by `parameter_path.delay_reach`).
     criterion
         "mean-square": convergence of second moments over the given network; "nominal": every packet on
         time; "passive": with any passive hand at every device. None: mean square if a link is unreliable,
@@ -422,9 +422,13 @@ def _pointwise_path(
     return PointwisePath(RadiusEvaluator(numeric, (parameter_ref,), _LOCATION, criterion), points, least)
 
 
-def _limit(option: str, text: str | None, parameter_ref: ParameterRef, unit: str) -> Fraction | None:
-    """Return a limit of the search from its text, in SI; None without a text."""
-    return None if text is None else option_value(option, text, subject=parameter_ref.name, unit=unit)
+def _limit(
+    option: str, limit: str | Fraction | None, parameter_ref: ParameterRef, unit: str
+) -> Fraction | None:
+    """Return a limit of the search in SI from a text or a number; None without a limit."""
+    if not isinstance(limit, str):
+        return limit
+    return option_value(option, limit, subject=parameter_ref.name, unit=unit)
 
 
 def _check_limits(
