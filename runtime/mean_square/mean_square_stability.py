@@ -165,10 +165,7 @@ def _mean_square_growth(numeric: NumericModel, bounded: bool) -> StabilityMeasur
     lossy = unreliable(system)
     if why := _reason_not_supported(system, lossy):
         raise NotSupportedError(why)
-    holding = all(
-        link.channel is not None and link.channel.on_loss == "hold" for link, law in lossy if law.mean_loss
-    )
-    if holding and all(law.trace is None and is_memoryless(law) for _, law in lossy):
+    if independent_channels(system):
         reception = build_reception(numeric, first=Fraction(0), stand_in=False)
         return independent_growth(system, reception, class_moments, bounded=bounded)
     extension = find_extension("loss_models")
@@ -176,6 +173,17 @@ def _mean_square_growth(numeric: NumericModel, bounded: bool) -> StabilityMeasur
         raise NotSupportedError(str(not_installed("loss_models")))
     growth: StabilityMeasure = extension.channel_growth(numeric, lossy, bounded=bounded)
     return growth
+
+
+def independent_channels(system: Model) -> bool:
+    """Return whether all packets are lost or delayed independently, a lost one being replaced by the last."""
+    lossy = unreliable(system)
+    return not _reason_not_supported(system, lossy) and all(
+        law.trace is None
+        and is_memoryless(law)
+        and (not law.mean_loss or (link.channel is not None and link.channel.on_loss == "hold"))
+        for link, law in lossy
+    )
 
 
 def independent_growth(

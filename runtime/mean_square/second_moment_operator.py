@@ -24,7 +24,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -60,6 +60,9 @@ DOUBLINGS, ENDLESS = 60, 1e100
 # distance is multiplied by this factor until its largest eigenvalue is below 1. The last constant is the
 # tolerance for no growth.
 NEAR, WIDER, NOTHING = 1e-9, 4.0, 1e-9
+
+# The relative step of central differences: their truncation is below 1e-7, their rounding below 1e-8.
+DIFFERENCE = 1e-4
 
 # The relative accuracy of the radius.
 CLOSE = 1e-13
@@ -320,6 +323,58 @@ def enclose_growth(operator: Operator, *, bounded: bool = True) -> GrowthBounds:
     return GrowthBounds(radius, low or 0.0, np.inf if high is None else high)
 
 
+def growth_with_slope(operator: Operator) -> tuple[float, float]:
+    """Return the growth factor μ of an operator over a cell of one parameter, and dμ/dε, in floats.
+
+    Matrices are (3, n, n'): value, radius, and change with the parameter ε.
+
+    Notes
+    -----
+    With the growth factor of the means m(ε), the deviation f is a smooth function of the distance μ − m, also
+    near its pole at μ = m. Along f = 0, d(μ − m)/dε = −f_ε/f_(μ−m); all by central differences.
+    """
+    operator = operator.balanced
+    if not np.isfinite(operator.means):
+        return np.nan, np.nan
+    below, above = (_moved(operator, step) for step in (-DIFFERENCE, DIFFERENCE))
+    means_slope, root = (above.means - below.means) / (2 * DIFFERENCE), _growth_by_noise(operator)
+    if root is None:
+        return operator.means, means_slope
+    distance = root - operator.means
+    rise = _deviation(above, above.means + distance) - _deviation(below, below.means + distance)
+    near, far = (_deviation(operator, operator.means + distance * (1 + s)) for s in (-DIFFERENCE, DIFFERENCE))
+    return root, means_slope - distance * rise / (far - near)
+
+
+def _moved(operator: Operator, step: float) -> Operator:
+    """Return the operator of float matrices at a place of its cell, −1 to 1."""
+
+    def at_step(block: Matrix) -> Matrix:
+        """Return a matrix at the place, without a radius."""
+        value = block[..., 0, :, :] + step * block[..., 2, :, :]
+        return np.stack([value, np.zeros_like(value)], axis=-3)
+
+    blocks = [
+        replace(
+            block,
+            matrix=at_step(block.matrix),
+            noise_inputs=at_step(block.noise_inputs),
+            noise_forms=at_step(block.noise_forms),
+            same_frame=None if block.same_frame is None else at_step(block.same_frame),
+        )
+        for block in operator.blocks
+    ]
+    return Operator(tuple(blocks), operator.noise_covariance)
+
+
+def _deviation(operator: Operator, growth: float) -> float:
+    """Return 1/ρ − 1 for the largest eigenvalue ρ of the gain at a growth per frame; −1 at its pole."""
+    gain = operator.gain(growth)
+    if gain is None or not np.isfinite(gain).all():
+        return -1.0
+    return 1 / max(float(largest_magnitudes(gain)), NOTHING) - 1
+
+
 def _growth_by_noise(operator: Operator) -> float | None:
     """Return the μ above the growth factor of means where the gain's largest eigenvalue ρ is 1.
 
@@ -327,14 +382,7 @@ def _growth_by_noise(operator: Operator) -> float | None:
     nearly a straight line from −1 at the growth factor of the means, where the gain has its pole.
     """
     least = max(operator.means, NOTHING)
-
-    def deviation(growth: float) -> float:
-        """Return 1/ρ − 1 for the largest eigenvalue ρ of the gain."""
-        gain = operator.gain(growth)
-        if gain is None or not np.isfinite(gain).all():
-            return -1.0
-        return 1 / max(float(largest_magnitudes(gain)), NOTHING) - 1
-
+    deviation = partial(_deviation, operator)
     low, gap = least * (1 + NEAR), max(1 - least, 0.1 * least)
     if deviation(low) > 0:
         return None

@@ -59,6 +59,7 @@ from apc.studies.stability_criteria import (
     SCALAR_CRITERIA,
     RadiusEvaluator,
     criterion_of,
+    radius_evaluator,
     refuse_timing_parameter,
     verdict_with,
 )
@@ -434,7 +435,7 @@ def _points_plane(
     stepped: bool,
 ) -> _Plane:
     """Return the plane of a model evaluated point by point; `stepped`: a time or a number of peers varies."""
-    source = RadiusEvaluator(numeric, parameter_refs, LOCATION, criterion)
+    source = radius_evaluator(numeric, parameter_refs, LOCATION, criterion)
     # Bounds are expensive: one point represents the rectangle.
     (errors,) = source.errors(rectangle.values(np.array([[0.5, 0.5]])))
     family = DirectFamily(source, rectangle, (DrivingPart(0, np.arange(1)),), (errors[0],))

@@ -72,9 +72,9 @@ from apc.studies.stability_criteria import (
     PASSIVE,
     SCALAR_CRITERIA,
     PointwisePath,
-    RadiusEvaluator,
     criterion_of,
     line_points,
+    radius_evaluator,
     refuse_timing_parameter,
     verdict_with,
 )
@@ -419,7 +419,7 @@ def _pointwise_path(
     """Return the path along a parameter by analyses, value by value."""
     system = numeric.model
     points, least = line_points(system, parameter_ref, *ends, value_now(system, parameter_ref) or 1.0)
-    return PointwisePath(RadiusEvaluator(numeric, (parameter_ref,), _LOCATION, criterion), points, least)
+    return PointwisePath(radius_evaluator(numeric, (parameter_ref,), _LOCATION, criterion), points, least)
 
 
 def _limit(

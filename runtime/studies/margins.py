@@ -54,6 +54,7 @@ from apc.studies.stability_criteria import (
     RadiusEvaluator,
     allowed,
     line_points,
+    radius_evaluator,
 )
 from apc.studies.timing_values import delay_now
 from apc.support.threads import single_threaded
@@ -354,7 +355,7 @@ def network_margins(numeric: NumericModel, nominal: Margins, *, quick: bool = Fa
             if unscaled and len(points) == 1:
                 rows.append(not_evaluated(system, item, "no search range follows from the present value 0"))
                 continue
-            source = RadiusEvaluator(numeric, (item,), LOCATION)
+            source = radius_evaluator(numeric, (item,), LOCATION)
             result = search(PointwisePath(source, points, least), first=True)
             evaluations += result.evaluations
             rows.append(_margin(system, item, result))

@@ -38,7 +38,7 @@ from apc.spectrum.eigenpairs import driving_parts, eigenpairs
 from apc.spectrum.modes import split
 from apc.spectrum.spectrum import solve_spectrum
 from apc.studies.evaluator import evaluator, free_parameters
-from apc.studies.stability_criteria import MEAN_SQUARE, NOMINAL, RadiusEvaluator
+from apc.studies.stability_criteria import MEAN_SQUARE, NOMINAL, radius_evaluator
 from apc.support.threads import single_threaded
 
 if TYPE_CHECKING:
@@ -283,9 +283,8 @@ def _finite_differences(
         present = value_now(system, parameter_ref)
         scale = present or 1.0  # for 0, the unit of the parameter
         try:
-            ((radius_value, slope),) = RadiusEvaluator(numeric, (parameter_ref,), LOCATION, criterion).slopes(
-                np.array([[present]]), np.array([[scale]])
-            )
+            evaluator = radius_evaluator(numeric, (parameter_ref,), LOCATION, criterion)
+            ((radius_value, slope),) = evaluator.slopes(np.array([[present]]), np.array([[scale]]))
         except ApcError:  # no verdict at a neighbouring value
             radius_value = slope = np.full((1, 1, 1), np.nan)
         # The derivative of the square, as the radius is the root of the growth.

@@ -36,7 +36,7 @@ from apc.studies.evaluator import evaluator_of_many
 from apc.studies.evaluator_choice import evaluator_for
 from apc.studies.frame_matrices import BatchEvaluator, MatrixSource
 from apc.studies.representative_delays import representative_delays
-from apc.studies.stability_criteria import SCALAR_CRITERIA, RadiusEvaluator
+from apc.studies.stability_criteria import SCALAR_CRITERIA, RadiusEvaluator, radius_evaluator
 from apc.support.extension_table import require_extension
 from apc.support.not_supported import NotSupportedError
 from apc.support.threads import load_pool
@@ -168,7 +168,7 @@ class ConstraintSet:
             numeric = self.numeric.at(topology)
             start = evaluator_for(numeric, parameter_refs, self.spec.criterion).smooth
             self.known[setting] = (
-                RadiusEvaluator(numeric, tuple(parameter_refs), LOCATION, self.spec.criterion)
+                radius_evaluator(numeric, parameter_refs, LOCATION, self.spec.criterion)
                 if start is None
                 else evaluator_of_many(start, parameter_refs, LOCATION)
             )
