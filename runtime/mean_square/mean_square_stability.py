@@ -2,7 +2,7 @@
 
 Takes: a `NumericModel` whose links have loss, jitter or a trace.
 Gives: `MeanSquareStability`, `mean_square_stability`; `MeanSquareVerdict`, `verdict_of`; `StabilityMeasure`,
-`mean_square_growth`, `independent_growth`, `worst_mean_square_growth`.
+`mean_square_growth`, `independent_channels`, `independent_growth`, `worst_mean_square_growth`.
 Guarantees: a network that is not supported has no verdict; a note gives the reason.
 Does not: analyze the nominal network (see `analysis`).
 """

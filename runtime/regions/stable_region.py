@@ -50,7 +50,7 @@ from apc.studies.evaluator import (
     overrides_at,
     parameters_suffice,
 )
-from apc.studies.evaluator_choice import EvaluatorKind, evaluator_for, kind_for_parameter
+from apc.studies.evaluator_choice import EvaluatorKind, evaluator_for, kind_for_parameter, radius_evaluator
 from apc.studies.frame_matrices import BatchEvaluator
 from apc.studies.stability_criteria import (
     MEAN_SQUARE,
@@ -59,7 +59,6 @@ from apc.studies.stability_criteria import (
     SCALAR_CRITERIA,
     RadiusEvaluator,
     criterion_of,
-    radius_evaluator,
     refuse_timing_parameter,
     verdict_with,
 )

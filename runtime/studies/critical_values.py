@@ -56,7 +56,7 @@ from apc.studies.evaluator import (
     reaches_count,
     reaches_time,
 )
-from apc.studies.evaluator_choice import EvaluatorKind, evaluator_for
+from apc.studies.evaluator_choice import EvaluatorKind, evaluator_for, radius_evaluator
 from apc.studies.parameter_path import (
     OPEN,
     SPAN,
@@ -74,7 +74,6 @@ from apc.studies.stability_criteria import (
     PointwisePath,
     criterion_of,
     line_points,
-    radius_evaluator,
     refuse_timing_parameter,
     verdict_with,
 )

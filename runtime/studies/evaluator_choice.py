@@ -1,7 +1,7 @@
 """The choice of the evaluator of a model's stability over some parameters.
 
 Takes: a `NumericModel`, the parameters that vary, and a stability criterion.
-Gives: `evaluator_for`, `EvaluatorChoice`, `EvaluatorKind`, `kind_for_parameter`.
+Gives: `evaluator_for`, `radius_evaluator`, `EvaluatorChoice`, `EvaluatorKind`, `kind_for_parameter`.
 Guarantees: one evaluator for each kind of parameters and criterion, the same in every study.
 Does not: evaluate, or select the values of the parameters.
 """
@@ -15,10 +15,11 @@ from dataclasses import dataclass
 from apc.analysis.analysis import prepare_at_start
 from apc.analysis.one_sided_slopes import sides
 from apc.compiler.compiled import Model
+from apc.compiler.errors import SourceLocation
 from apc.lifting.numeric_model import NumericModel
 from apc.parameter_values.parameter_names import ParameterRef
 from apc.studies.evaluator import generic, reaches_count, reaches_time
-from apc.studies.stability_criteria import NOMINAL, SCALAR_CRITERIA
+from apc.studies.stability_criteria import MEAN_SQUARE, NOMINAL, SCALAR_CRITERIA, RadiusEvaluator
 from apc.studies.timing_values import reaches_period
 
 
@@ -84,6 +85,20 @@ def evaluator_for(
     timed = [EvaluatorKind.COUNTS, EvaluatorKind.PERIODS, *([] if scalar else [EvaluatorKind.DELAYS])]
     untimed = EvaluatorKind.MATRICES if linearized else EvaluatorKind.POINTS
     return EvaluatorChoice(next((kind for kind in timed if kind in required), untimed), linearized, smooth)
+
+
+def radius_evaluator(
+    numeric: NumericModel,
+    parameter_refs: Sequence[ParameterRef],
+    location: SourceLocation,
+    criterion: str = MEAN_SQUARE,
+) -> RadiusEvaluator:
+    """Return the evaluator of a criterion over some parameters, the arguments as its fields."""
+    if criterion != MEAN_SQUARE:
+        return RadiusEvaluator(numeric, tuple(parameter_refs), location, criterion)
+    from apc.studies.moment_evaluator import moment_evaluator  # most models have an ideal network
+
+    return moment_evaluator(numeric, parameter_refs, location)
 
 
 def _sides_change(numeric: NumericModel, parameter_refs: Sequence[ParameterRef]) -> bool:

@@ -44,6 +44,7 @@ from apc.spectrum.peer_classes import states_of
 from apc.spectrum.spectrum import finite
 from apc.studies.crossing import ESTIMATE, CrossingReport, search
 from apc.studies.evaluator import evaluator, free_parameters, many_packets
+from apc.studies.evaluator_choice import radius_evaluator
 from apc.studies.parameter_path import DelayPath, MatrixPath, delay_reach, verdict_of
 from apc.studies.sensitivity import channel_parameters, not_varied
 from apc.studies.stability_criteria import (
@@ -54,7 +55,6 @@ from apc.studies.stability_criteria import (
     RadiusEvaluator,
     allowed,
     line_points,
-    radius_evaluator,
 )
 from apc.studies.timing_values import delay_now
 from apc.support.threads import single_threaded

@@ -38,7 +38,8 @@ from apc.spectrum.eigenpairs import driving_parts, eigenpairs
 from apc.spectrum.modes import split
 from apc.spectrum.spectrum import solve_spectrum
 from apc.studies.evaluator import evaluator, free_parameters
-from apc.studies.stability_criteria import MEAN_SQUARE, NOMINAL, radius_evaluator
+from apc.studies.evaluator_choice import radius_evaluator
+from apc.studies.stability_criteria import MEAN_SQUARE, NOMINAL
 from apc.support.threads import single_threaded
 
 if TYPE_CHECKING:

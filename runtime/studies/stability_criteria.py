@@ -2,7 +2,7 @@
 
 Takes: a `Model` and the name of a parameter, also of its links' losses.
 Gives: `MEAN_SQUARE`, `NOMINAL`, `PASSIVE`, `SCALAR_CRITERIA`, `criterion_of`, `refuse_timing_parameter`;
-`PointwisePath`, `line_points`, `BOUNDED`; `verdict_with`, `allowed`; `RadiusEvaluator`, `radius_evaluator`.
+`PointwisePath`, `line_points`, `BOUNDED`; `verdict_with`, `allowed`; `RadiusEvaluator`.
 Guarantees: a verdict follows from bounds on the growth of second moments, or on the energy that passive hands
 can extract, expressed as a growth (see `absolute_stability.passivity_radius`); nominally, from the analysis
 itself.
@@ -273,20 +273,6 @@ class RadiusEvaluator:
         roots = [1.0 if self.criterion == NOMINAL else math.sqrt(verdict.radius) for verdict in verdicts]
         errors = [verdict.error / max(root, LEAST) for verdict, root in zip(verdicts, roots, strict=True)]
         return (np.array(errors)[:, None, None],)
-
-
-def radius_evaluator(
-    numeric: NumericModel,
-    parameter_refs: Sequence[ParameterRef],
-    location: SourceLocation,
-    criterion: str = MEAN_SQUARE,
-) -> RadiusEvaluator:
-    """Return the evaluator of a criterion over some parameters, the arguments as its fields."""
-    if criterion != MEAN_SQUARE:
-        return RadiusEvaluator(numeric, tuple(parameter_refs), location, criterion)
-    from apc.studies.moment_evaluator import moment_evaluator  # most models have an ideal network
-
-    return moment_evaluator(numeric, parameter_refs, location)
 
 
 def allowed(system: Model, parameter_ref: ParameterRef) -> tuple[float, float]:

@@ -33,10 +33,10 @@ from apc.lifting.numeric_model import NumericModel
 from apc.parameter_values.overrides import Override, apply
 from apc.spectrum.eigenpairs import eigenvalues, largest_magnitudes
 from apc.studies.evaluator import evaluator_of_many
-from apc.studies.evaluator_choice import evaluator_for
+from apc.studies.evaluator_choice import evaluator_for, radius_evaluator
 from apc.studies.frame_matrices import BatchEvaluator, MatrixSource
 from apc.studies.representative_delays import representative_delays
-from apc.studies.stability_criteria import SCALAR_CRITERIA, RadiusEvaluator, radius_evaluator
+from apc.studies.stability_criteria import SCALAR_CRITERIA, RadiusEvaluator
 from apc.support.extension_table import require_extension
 from apc.support.not_supported import NotSupportedError
 from apc.support.threads import load_pool

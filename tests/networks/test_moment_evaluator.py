@@ -9,8 +9,9 @@ import apc
 from apc.compiler.errors import SourceLocation
 from apc.lifting.numeric_model import numeric_model
 from apc.parameter_values.parameter_names import find
+from apc.studies.evaluator_choice import radius_evaluator
 from apc.studies.moment_evaluator import MomentEvaluator
-from apc.studies.stability_criteria import RadiusEvaluator, radius_evaluator
+from apc.studies.stability_criteria import RadiusEvaluator
 from tests.topologies import TOPOLOGIES
 
 HERE = SourceLocation("test")
