@@ -42,6 +42,7 @@ FORMAT = 16  # the format version of NAME.apc
 LARGEST = 256 * 2**20  # bytes of the file
 LARGEST_ORIGIN = 64 * 2**20  # bytes of the third line, which require up to ten times the memory
 SUFFIX = ".yaml"  # of the files in a folder of components
+WITHOUT_COMPONENTS = {"published", "topologies"}  # folders of models/ outside the component library
 HANDS_CHANGE = "hands"  # replaces the parameter name if hands were attached to devices
 _RATIONAL = re.compile(r"-?[0-9]{1,4000}(/[1-9][0-9]{,4000})?")
 FOREIGN = "is damaged, or was not written by apc compile"
@@ -219,7 +220,7 @@ def builtin_files() -> dict[str, Path]:
     return {
         "".join(word.capitalize() for word in path.stem.split("-")): path
         for path in sorted(models.rglob("*.yaml"))
-        if "topologies" not in path.relative_to(models).parts
+        if not WITHOUT_COMPONENTS.intersection(path.relative_to(models).parts)
     }
 
 

@@ -16,7 +16,11 @@ import apc
 from apc.__main__ import run
 from tests.topologies import ROOT, TOPOLOGIES
 
-LIBRARY = [path for path in (ROOT / "models").rglob("*.yaml") if path.parent != TOPOLOGIES]
+LIBRARY = [
+    path
+    for path in (ROOT / "models").rglob("*.yaml")
+    if path.relative_to(ROOT / "models").parts[0] not in ("published", "topologies")
+]
 NAMES = sorted("".join(word.capitalize() for word in path.stem.split("-")) for path in LIBRARY)
 Call = Callable[..., tuple[int, str, str]]
 
