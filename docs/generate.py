@@ -1,4 +1,4 @@
-"""Pages of the manual that are made from the program: components, topologies, messages, tutorials.
+"""Pages of the manual that are made from the program: components, topologies, results, messages, tutorials.
 
 Takes: the sources of this checkout. Gives: `write_pages`.
 Guarantees: a page is written only if its text has changed, so that Sphinx reads only those again.
@@ -10,7 +10,9 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
+import yaml
 from latex import equation_latex
 
 import apc
@@ -24,6 +26,7 @@ from apc.output.pictures import svg_text
 
 ROOT = Path(__file__).parent.parent
 TUTORIALS = ROOT / "models" / "notebooks"
+PUBLISHED = ROOT / "models" / "published" / "results.yaml"
 MESSAGES = ROOT / "tests" / "language" / "messages.txt"
 FOLDERS = {
     "contacts": "Contacts",
@@ -41,6 +44,7 @@ def write_pages(docs: Path) -> None:
     for folder, rows in library_document(library).items():
         _write(docs / "reference" / "components" / f"{folder}.md", _components(library, folder, rows))
     _write(docs / "reference" / "topologies.md", "\n".join(_gallery(docs / "_static" / "topologies")))
+    _write(docs / "reference" / "published-results.md", "\n".join(_published()) + "\n")
     _write(docs / "reference" / "messages.md", "\n".join(_messages()))
     for notebook in sorted(TUTORIALS.glob("*.ipynb")):
         _write(docs / "tutorial" / notebook.name, notebook.read_text(encoding="utf-8"))
@@ -139,6 +143,62 @@ def _gallery(pictures: Path) -> Iterator[str]:
         yield f"![Peers, parts and links of {name}](../_static/topologies/{name}.svg)"
         yield ""
         yield from _folded("Topology", path.read_text(encoding="utf-8").rstrip())
+
+
+# ---- published results ----
+
+PUBLISHED_HEAD = """\
+# Published results
+
+`apc` reproduces the results of this page, which is generated from `models/published/results.yaml`. The tests
+repeat each command and compare its result with the number of the source. All numbers are in SI units.
+Commands are called in the folder of a checkout.
+
+| kind | meaning |
+|---|---|
+| published | the source has the number, or the verdict, at the place that is given |
+| closed form | the number follows from a formula of the source |
+
+The tolerance is the permitted relative difference between both numbers. Where a formula is an approximation,
+a test also compares the result with an independent computation.
+"""
+
+
+def _published() -> Iterator[str]:
+    """Yield the page of published results: a table, commands and topologies of each source."""
+    yield PUBLISHED_HEAD
+    for source in yaml.load(PUBLISHED.read_text(encoding="utf-8"), yaml.BaseLoader):
+        rows = source["results"]
+        yield from (f"## {source['title']}", "", f"{source['statement']} {{cite}}`{source['cite']}`", "")
+        if place := _place(source):
+            yield from (f"{place[0].upper()}{place[1:]}.", "")
+        yield "| result | basis | source | `apc` | tolerance |"
+        yield "|---|---|---|---|---|"
+        yield from (_published_row(row, source | row) for row in rows)
+        yield from ("", "Commands, in the order of the table:", "", "```sh")
+        yield from dict.fromkeys(row[key] for row in rows for key in ("command", "divided_by") if key in row)
+        yield from ("```", "")
+        names = {name for row in rows for name in re.findall(r"models/published/\S+\.yaml", row["command"])}
+        folders = sorted({(ROOT / name).parent for name in names})
+        for path in (path for folder in folders for path in sorted(folder.rglob("*.yaml"))):
+            yield from _folded(f"{path.parent.name}/{path.name}", path.read_text(encoding="utf-8").rstrip())
+
+
+def _published_row(own: dict[str, Any], row: dict[str, Any]) -> str:
+    """Return one row of the table of a source; `row` has the keys of the source, too."""
+    values = ", ".join(f"{name} = {value}" for name, value in own.get("values", {}).items())
+    place = "; ".join(filter(None, (_place(own), values)))
+    unit = "" if row["unit"] == "1" else f" {row['unit']}"
+    words = row["tolerance"] == "none"
+    source, found = (text if words else text + unit for text in (row["number"], row["apc"]))
+    tolerance = row["reason"] if words else f"{row['tolerance']}: {row['reason']}"
+    return f"| {row['result']} | {place} | {source} | {found} | {tolerance} |"
+
+
+def _place(row: dict[str, Any]) -> str:
+    """Return kind, place and formula of a number, of those that a row has."""
+    formula = f"`{row['formula']}`" if "formula" in row else ""
+    return ": ".join(filter(None, (", ".join(filter(None, (row.get("kind"), row.get("where")))), formula)))
 
 
 # ---- messages ----
