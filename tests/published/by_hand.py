@@ -93,6 +93,23 @@ def growth(*delays: float) -> float:
     return float(radius(loop) ** (1 / len(delays)))
 
 
+# ---- sampled state feedback ----
+
+
+def largest_period(a: float, b: float, k1: float, k2: float) -> float:
+    """Return the largest stable period of x″ = −a x′ + b u, u = −k1 x − k2 x′ of samples."""
+    process, force, gain = np.array([[0, 1], [0, -a]]), np.array([[0], [b]]), np.array([[k1, k2]])
+
+    def radius_at(period: float) -> float:
+        free, push = held(process, force, period)
+        return radius(free - push @ gain)
+
+    return last_stable(radius_at, 0.01, 5.0)
+
+
+# ---- words ----
+
+
 def verdict(*radii: float) -> str:
     """Return the verdict for all of some spectral radii."""
     return "stable" if max(radii) < 1 else "unstable"
