@@ -825,7 +825,7 @@ def sweep(
         A .parquet or .csv file; finished parts are stored in its folder, and the same call resumes after
         them.
     jobs
-        The number of processes; by default the number of cores.
+        The number of processes; by default the number of cores, for a sweep of more than some seconds.
     cluster
         The address of a Dask scheduler.
     """

@@ -1,7 +1,7 @@
 """Conversion of units and quantities to exact SI numbers.
 
 Takes: a text (`N*s/m`, `500 N/m`), and its location. Gives: `Unit`, `Quantity`; `parse_unit`,
-`parse_quantity`, and `quantity`, which must match a unit; `COMMON`.
+`parse_quantity`, and `quantity`, which must match a unit; `COMMON`; `TABULATED`, `unit_by_pint`.
 Guarantees: values are exact rationals (0.1 kg is 1/10, an angle in degrees uses π to 50 digits); the cost of
 parsing is bounded; a unit that is not in units.txt, such as the grain, is not accepted.
 Does not: determine the units of parameters, or check expressions (see `unit_check`).
@@ -23,7 +23,6 @@ from itertools import product
 from pathlib import Path
 from typing import Any, NoReturn
 
-import pint
 from lark import Token
 from lark.exceptions import UnexpectedCharacters, UnexpectedToken
 
@@ -46,6 +45,45 @@ TURN = 2 * PI  # a cycle in radians
 MAX_LENGTH = 200  # characters of a quantity
 MAX_EXPONENT = 9  # of a unit: m^9
 MOST_CASED = 6  # names of a unit that are compared with the common ones in another case
+
+# Units with scale, dimension and angle unit, as Pint defines them; Pint is imported for other units only.
+TABULATED = """
+1 1 1
+% 1/100 1
+m 1 m
+mm 1/1000 m
+um 1/1000000 m
+s 1 s
+ms 1/1000 s
+us 1/1000000 s
+min 60 s
+kg 1 kg
+g 1/1000 kg
+N 1 kg*m*s^-2
+mN 1/1000 kg*m*s^-2
+kN 1000 kg*m*s^-2
+J 1 kg*m^2*s^-2
+N/m 1 kg*s^-2
+N/mm 1000 kg*s^-2
+kN/m 1000 kg*s^-2
+N*s/m 1 kg*s^-1
+m/s 1 m*s^-1
+mm/s 1/1000 m*s^-1
+m/s^2 1 m*s^-2
+N*m 1 kg*m^2*s^-2
+N*m/rad 1 kg*m^2*s^-2 rad
+N*m*s/rad 1 kg*m^2*s^-1 rad
+N*m*s 1 kg*m^2*s^-1
+rad 1 1 rad
+rad/s 1 s^-1 rad
+Hz 1 s^-1 Hz
+kHz 1000 s^-1 Hz
+1/s 1 s^-1
+1/m 1 m^-1
+kg*m^2 1 kg*m^2
+N/m^(3/2) 1 kg*m^-1/2*s^-2
+N*s/m^(5/2) 1 kg*m^-3/2*s^-1
+"""
 
 # Common units, which are proposed for a misspelled name or a name in the wrong case.
 COMMON = (
@@ -354,7 +392,24 @@ def _number(text: str, offset: int) -> Fraction:
 
 @lru_cache(maxsize=1024)
 def _unit(text: str) -> Unit:
-    """Return the unit of a text, cached: its scale and dimension by Pint. Raises ParseError."""
+    """Return the unit of a text, cached. Raises ParseError."""
+    known = _tabulated_units().get(text.strip())
+    return unit_by_pint(text) if known is None else known
+
+
+@cache
+def _tabulated_units() -> dict[str, Unit]:
+    """Return the units of the table by their texts."""
+    result = {}
+    for name, scale, factors, *turning in map(str.split, TABULATED.strip().splitlines()):
+        powers = (factor.partition("^") for factor in factors.split("*") if factor != "1")
+        exponents = tuple((base, Fraction(power or 1)) for base, _, power in powers)
+        result[name] = Unit(name, Fraction(scale), Dimension(exponents, "".join(turning)))
+    return result
+
+
+def unit_by_pint(text: str) -> Unit:
+    """Return the unit of a text by the grammar of units and Pint's definitions. Raises ParseError."""
     if len(text) > MAX_LENGTH:
         raise ParseError("E222", 0, "unit", f"at most {MAX_LENGTH} characters", f"{len(text)}")
     try:
@@ -456,12 +511,16 @@ def _grammar() -> Callable[[str, str], Any]:
 @cache
 def registry() -> Any:
     """Return Pint's registry of the supported units, with exact numbers."""
+    import pint  # takes as long as many analyses, and few units are not in the table
+
     return pint.UnitRegistry(str(Path(__file__).with_name("units.txt")), non_int_type=Fraction)
 
 
 @cache
 def _full_registry() -> Any:
     """Return Pint's registry of all its units, for messages; its creation takes a third of a second."""
+    import pint
+
     return pint.UnitRegistry(non_int_type=Fraction)
 
 

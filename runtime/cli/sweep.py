@@ -42,7 +42,9 @@ def sweep_command(
     criterion: str | None,
     hands: str,
     settings: tuple[str, ...],
-    jobs: int | None = option("Number of processes.", "N", type=WholeNumber(min=1), show_default="all cores"),
+    jobs: int | None = option(
+        "Number of processes.", "N", type=WholeNumber(min=1), show_default="all cores, after 2 s"
+    ),
     cluster: str | None = option("Compute on a Dask cluster, tcp://HOST:8786.", "ADDRESS"),
     patience: str | None = option(
         "Abort after this time without a result.", '"TIME"', show_default="no limit"

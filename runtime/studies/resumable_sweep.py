@@ -10,6 +10,7 @@ Does not: start processes (see `processes`, `cluster`), or print.
 from __future__ import annotations
 
 import hashlib
+import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
@@ -62,6 +63,8 @@ LOCATION = SourceLocation("sweep")
 PART_POINTS, QUICK_POINTS = 64, 8192
 SHARES = 32
 MOST_PARTS = 10_000
+# Seconds of computing in this process before others are started: starting them takes about a second.
+SERIAL_SECONDS = 2.0
 
 Progress = Callable[[int, int], None]  # points done, points in all
 
@@ -171,7 +174,8 @@ def sweep(
         The file to write, .csv or .parquet. Finished parts are stored next to it until the sweep is complete,
         and used by the same sweep later. Without a file the rows are only returned.
     jobs
-        The number of processes, by default the number of cores; 1 is this process.
+        The number of processes; 1 is this process. By default the number of cores, after some seconds in this
+        process.
     cluster
         The address of a Dask scheduler that computes instead of local processes.
     progress
@@ -220,7 +224,7 @@ def sweep(
     work = Work(model_bytes(system), work_of, grid, part_points(grid.points, quick=quantity.quick))
     made_of = _description(system, work)
     parts = _open_storage(out, made_of)
-    executors = Executors(jobs or cores(), cluster, patience or Patience())
+    executors = Executors(jobs, cluster, patience or Patience())
     notes = _compute_missing(work, parts, executors, progress)
     columns = (*(TableColumn(axis.heading) for axis in grid.axes), *quantity.columns)
     counts = Counter[str](), Counter[str]()
@@ -319,9 +323,12 @@ def _open_storage(out: Path | None, made_of: Mapping[str, Any]) -> _Storage:
 
 @dataclass(frozen=True, slots=True)
 class Executors:
-    """The executors of a sweep: a number of local processes, or a cluster's address; and their time limit."""
+    """The executors of a sweep: a number of local processes, or a cluster's address; and their time limit.
 
-    jobs: int
+    Without a number, parts are computed in this process first, and on all cores if that takes long.
+    """
+
+    jobs: int | None
     cluster: str | None
     patience: Patience
 
@@ -342,15 +349,26 @@ def _compute_missing(
         progress(done, work.grid.points)
     if not missing:
         return tuple(notes)
-    with _workers(work, min(executors.jobs, len(missing)), executors.cluster) as workers:
-        for computed in results(workers, missing, executors.patience, LOCATION):
-            if computed.versions != program_versions():
-                raise ApcError(_version_error(computed, executors.cluster))
-            stored.write(computed.part, computed.cells)
-            done += len(work.points_of(computed.part))
-            if progress:
-                progress(done, work.grid.points)
+    for computed in _parts(work, missing, executors):
+        if computed.versions != program_versions():
+            raise ApcError(_version_error(computed, executors.cluster))
+        stored.write(computed.part, computed.cells)
+        done += len(work.points_of(computed.part))
+        if progress:
+            progress(done, work.grid.points)
     return tuple(notes)
+
+
+def _parts(work: Work, missing: Sequence[int], executors: Executors) -> Iterator[Computed]:
+    """Yield the missing parts, each when it is computed."""
+    remaining, jobs = list(missing), executors.jobs
+    if jobs is None and executors.cluster is None:
+        jobs, begun = cores(), time.monotonic()
+        while remaining and (jobs == 1 or time.monotonic() - begun < SERIAL_SECONDS):
+            yield compute_part(work, remaining.pop(0))
+    if remaining:
+        with _workers(work, min(jobs or cores(), len(remaining)), executors.cluster) as workers:
+            yield from results(workers, remaining, executors.patience, LOCATION)
 
 
 def _workers(work: Work, jobs: int, cluster: str | None) -> AbstractContextManager[Workers[int, Computed]]:

@@ -9,6 +9,8 @@ import pint
 import pytest
 
 from apc.compiler.compiled import Parameter
+from apc.compiler.errors import SourceLocation
+from apc.compiler.language.units import TABULATED, parse_unit, unit_by_pint
 from tests.topologies import ONE_MASS, compiled, told
 
 
@@ -99,3 +101,12 @@ def test_an_operator_behind_a_number_makes_an_expression(text: str) -> None:
     system = compiled(f"{ONE_MASS}parameters: {{rate: 2, p: {text}}}\n")
     found = {one.name: one.exact for one in system.parameters}
     assert found["p"] == eval(text, {"peers": 1, "rate": Fraction(2)})
+
+
+def test_the_table_of_units_is_that_of_pint() -> None:
+    names = [line.split()[0] for line in TABULATED.strip().splitlines()]
+    assert len(names) == len(set(names)) > 30
+    for name in names:
+        tabulated, defined = parse_unit(name, SourceLocation("test")), unit_by_pint(name)
+        assert tabulated == defined
+        assert tabulated.dimension.turning == defined.dimension.turning  # ignored by ==
