@@ -82,7 +82,7 @@ def check_size(number: str, at: int | Token, code: str) -> None:
     for exponent in re.findall(r"[eE]([+-]?[0-9]+)", number):
         if abs(int(exponent)) > MAX_NUMBER_EXPONENT:
             limit = f"an exponent from -{MAX_NUMBER_EXPONENT} to {MAX_NUMBER_EXPONENT}"
-            raise ParseError(code, at, "number", limit, cut(exponent))
+            raise ParseError(code, at, f"number {cut(number)}", limit)
 
 
 def unclosed(stack: Sequence[object]) -> int:

@@ -140,6 +140,6 @@ def _delay_column(names: Headings) -> int:
         if name == DELAY:
             if unit.dimension == SECOND:
                 return column
-            got, location = f"delay {'without a unit' if unit == NO_UNIT else f'in {unit.text}'}", at
+            got, location = "no unit" if unit == NO_UNIT else f"delay in {unit.text}", at
     expected = "a column delay in a unit of time"
     raise fault("E702", location, "trace", expected, brief(got), "delay [ms]")

@@ -261,14 +261,15 @@ def quantity(
             if not location.line:  # a command-line option: the fix is the entire value
                 fix = f"{before}{text.strip().replace(mistake.subject, fix)}"
             raise ApcError(replace(mistake, fix=fix)) from None
+        if mistake.code == "E221" and not mistake.expected and not mistake.fix:  # a division by zero
+            raise ApcError(replace(mistake, message=f"{subject}: {mistake.message}")) from None
         if mistake.code != "E221" or mistake.fix:
             raise error from None
         example, got = f"{before}1 {unit}".removesuffix(" 1"), cut(text) or "nothing"
-        raise ApcError(
-            Diagnostic(
-                "E221", location, subject, _finite_number(named, text), cut(text) or "nothing", example
-            )
-        ) from None
+        expected = named
+        if _NOT_FINITE.match(text.strip()):  # no finite number is more probable than another
+            expected, example = "a finite number" if unit == "1" else f"a finite number in {unit}", ""
+        raise ApcError(Diagnostic("E221", location, subject, expected, got, example)) from None
     actual, due = parsed.unit.dimension, requested.dimension
     got, right = cut(text.strip()), unit
     if actual == due:
@@ -290,15 +291,6 @@ def quantity(
         if actual == due.power(-1) and actual.turning != "rad" and parsed.value:
             fix = f"{before}{float(1 / (parsed.value * requested.scale)):.9g} {unit}"
     raise ApcError(Diagnostic("E204", location, subject, named, got, fix))
-
-
-def _finite_number(named: str, text: str) -> str:
-    """Return the expected value of a text that is not a number: a finite number if it is written as a number
-    that is not finite.
-    """
-    if not re.match(r"\s*[-+]?(\.?(nan|inf)|[\d.]+\s*/\s*0)", text, re.IGNORECASE):
-        return named
-    return "a finite number" if named == "a plain number" else f"a finite number in {named}"
 
 
 def _in_usual_case(text: str, dimension: Dimension) -> str:
@@ -421,7 +413,7 @@ def unit_by_pint(text: str) -> Unit:
         _refuse(text, fault)
     dimensions = registry().get_dimensionality(powers)
     if any(abs(power) > MAX_EXPONENT for power in (*powers.values(), *dimensions.values())):
-        message = f"unit {cut(text.strip())}: an exponent or the scale is too large"
+        message = f"unit {cut(text.strip())}: an exponent or the factor to SI units is too large"
         raise ParseError("E225", 0, message)
     # The square of the scale, so that the root of a square is exact; Pint's unit of mass is the gram.
     square, _ = registry().get_root_units(powers**2)
@@ -429,7 +421,7 @@ def unit_by_pint(text: str) -> Unit:
     rational = Fraction(square)
     scale = Fraction(math.isqrt(rational.numerator), math.isqrt(rational.denominator))
     if isinstance(square, float) or scale**2 != square:
-        message = f"unit {cut(text.strip())}: the scale is not a rational number"
+        message = f"unit {cut(text.strip())}: its factor to SI units is irrational"
         raise ParseError("E222", len(text) - len(text.lstrip()), message)
     exponents = tuple(sorted((_BASES[base], power) for base, power in dimensions.items()))
     return Unit(text.strip(), scale, Dimension(exponents, _turning(text)))
@@ -439,7 +431,7 @@ def _refuse(text: str, fault: UnexpectedToken) -> NoReturn:
     """Raise ParseError (E222) for a token that cannot follow in a unit."""
     token, bare, fix = fault.token, text.strip(), ""
     if "NAME" in fault.expected:
-        expected = "a name such as N, m or s"
+        expected = "a name, such as N, m or s"
     elif "$END" not in fault.expected and "NUMBER" in fault.expected:
         expected = f"a whole exponent up to {MAX_EXPONENT}"
     elif unclosed(fault.state.value_stack) >= 0:
@@ -448,8 +440,8 @@ def _refuse(text: str, fault: UnexpectedToken) -> NoReturn:
         expected, joined = "* or / between two unit names", re.sub(r"(\w)\s+(?=\w)", r"\1*", bare)
         fix = joined if joined != bare and "+" not in bare else ""
     at = len(text.rstrip()) if token.type == "$END" else token
-    got = {"$END": "the end of the text", "POWER": "^"}.get(token.type, str(token))
-    raise ParseError("E222", at, "unit", expected, got, fix)
+    got = {"$END": "nothing", "POWER": "^"}.get(token.type, str(token))
+    raise ParseError("E222", at, f"unit {cut(bare)}", expected, got, fix)
 
 
 def _turning(text: str) -> str:
@@ -472,7 +464,7 @@ class _Units(TREE):
     def unity(self, parts: list[Token]) -> Any:
         """Return the unit 1. Raises ParseError for other numbers."""
         if parts[0] != "1":
-            expected = "a name such as N, m or s"
+            expected = "a name, such as N, m or s"
             raise ParseError("E222", parts[0], "unit", expected, str(parts[0]))
         return registry().UnitsContainer()
 

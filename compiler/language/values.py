@@ -41,7 +41,7 @@ _QUANTITY = re.compile(
 _SPACED = re.compile(r"[+-]?[0-9]{1,3}([ _'\u00a0\u2009][0-9]{3})+(?![0-9])")
 _COMMA = re.compile(r"([+-]?[0-9]+),([0-9]+)([^0-9,].*)?", re.DOTALL)
 _COMPUTED = re.compile(r"(?P<numbers>[-+*/^().\d\s]*(?:pi[-+*/^().\d\s]*)*)(?P<unit>[^\W\d_°%µΩ].*)")
-_NO_UNITS = "a number with its unit, or an expression without units"
+_ONE_NUMBER = "one number and its unit"
 _WORD_NUMBER = re.compile(r"[+-]?\.?(nan|inf|infinity)\b", re.IGNORECASE)
 
 
@@ -172,10 +172,10 @@ def read_binding(
             tree = _tree(text, location)
             actual = _dimension(tree, text, location, subject, known, names_known)
             if actual is not None and actual != ANY and (actual != dimension or actual.clashes(dimension)):
-                got, fix = _misfit(tree, actual, dimension, unit)
-                raise fault(
-                    "E204", location, subject, unit, f"{brief(text)}, which {got}", f"{subject}: {fix}"
-                )
+                got, fix, advice = _misfit(tree, actual, dimension, unit)
+                fix = fix and f"{subject}: {fix}"
+                expected = "a plain number" if unit == "1" else unit
+                raise fault("E204", location, subject, expected, f"{brief(text)}, which {got}", fix, advice)
             return ValueBinding(None, tree, dimension, location)
         _refuse_trailing(text, location, subject, names_known)
         _refuse_mixture(text, location, subject, names_known)
@@ -208,7 +208,7 @@ def _refuse_computed(text: str, location: SourceLocation, subject: str, unit: st
         if parse_unit(match["unit"], location).dimension == parse_unit(unit, location).dimension:
             fix = f"{subject}: {float(number):.9g} {match['unit']}"
     if fix:
-        raise fault("E204", location, subject, _NO_UNITS, brief(text), fix)
+        raise fault("E204", location, subject, _ONE_NUMBER, brief(text), fix)
 
 
 # A number next to a word, without a sign between them.
@@ -224,7 +224,8 @@ def _refuse_trailing(text: str, location: SourceLocation, subject: str, names_kn
         parse_unit(implicit_product["word"], location)
         return
     fix = f"{subject}: {implicit_product['number']}*{text.strip()[implicit_product.start('rest') :]}"
-    raise fault("E204", location, subject, _NO_UNITS, brief(text), fix)
+    expected = f"* between {implicit_product['number']} and {implicit_product['word']}"
+    raise fault("E204", location, subject, expected, brief(text), fix)
 
 
 def _refuse_mixture(text: str, location: SourceLocation, subject: str, names_known: Collection[str]) -> None:
@@ -238,20 +239,23 @@ def _refuse_mixture(text: str, location: SourceLocation, subject: str, names_kno
                 parse_unit(word.group(), location)
                 return
             number, rest = before[:-1].strip(), text[len(before) - 1 :].strip()
-            fix, advice = f"{subject}: total{rest}", f"define parameters: {{total: {number}}}"
-            raise fault("E204", location, subject, _NO_UNITS, brief(text), fix, advice)
+            advice = f"define total: {number} in parameters and write {subject}: total{rest}"
+            raise fault("E204", location, subject, _ONE_NUMBER, brief(text), advice=advice)
 
 
-def _misfit(tree: Expr, actual: Dimension, due: Dimension, unit: str) -> tuple[str, str]:
-    """Return the texts for an expression of a wrong dimension: its actual unit, and the value of the fix."""
+def _misfit(tree: Expr, actual: Dimension, due: Dimension, unit: str) -> tuple[str, str, str]:
+    """Return the texts for an expression of a wrong dimension: its actual unit, the value of the fix, and
+    the advice.
+    """
+    if actual == DIMENSIONLESS != due:
+        return "has no unit", "", f"multiply it by a parameter in {unit}"
     if actual != due:
-        got = "has no unit" if actual == DIMENSIONLESS else f"is in {format_dimension(actual)}"
-        return got, f"1 {unit}".removesuffix(" 1")
+        return f"is in {format_dimension(actual)}", "", ""
     # The expression is a name, a sum or a choice: a product has no angle unit.
     text = format_expression(tree)
     whole = text if isinstance(tree, Name) else f"({text})"
     fix = f"2*pi*{whole}" if due.turning == "rad" else f"{whole}/(2*pi)"
-    return f"is in {format_dimension(actual)}", fix
+    return f"is in {format_dimension(actual)}", fix, ""
 
 
 def _tree(text: str, location: SourceLocation) -> Expr:

@@ -17,11 +17,11 @@ from typing import TypeVar
 
 from apc.compiler.errors import ApcError, Diagnostic, Mistakes, SourceLocation, equally_near, nearest, visible
 from apc.compiler.source.nodes import Mapping, Node, Scalar, Sequence
-from apc.compiler.wording import enumerated
 
 T = TypeVar("T")
 D = TypeVar("D")
 
+MOST_OFFERED = 2  # values of a list that are offered instead of the list
 IDENTIFIER = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,62}\Z")
 
 
@@ -50,10 +50,18 @@ def brief(text: str) -> str:
 
 
 def named(text: str) -> str:
-    """Return a short name for a message, with the first character that is not ASCII spelled out."""
+    """Return a short name for a message, with the first character that is not ASCII spelled out.
+
+    A text of several words has quotes.
+    """
     foreign = next((character for character in text if not character.isascii()), "")
     spelled = f" (U+{ord(foreign):04X}, {unicodedata.name(foreign, 'unnamed character')})" if foreign else ""
-    return brief(text) + spelled
+    return quoted(text) + spelled
+
+
+def quoted(text: str) -> str:
+    """Return a short text for a message, in quotes if it has several words."""
+    return f"'{brief(text)}'" if len(text.split()) > 1 else brief(text)
 
 
 def fault(
@@ -98,21 +106,38 @@ def mapping_of(node: Node, subject: str, fix: str = "") -> Mapping:
 
 
 def text_of(node: Node, subject: str, fix: str = "") -> str:
-    """Return the text of a scalar that is not empty; arguments and error as for `mapping_of`."""
+    """Return the text of a scalar that is not empty; arguments and error as for `mapping_of`.
+
+    The fix for a list or mapping has its values instead of that of the example `fix`.
+    """
     if isinstance(node, Scalar) and node.text.strip() and node.value is not None:
         return node.text
+    key, colon, _ = fix.partition(": ")
+    if colon and (texts := list(dict.fromkeys(_texts_in(node)))):
+        fix = ", or ".join(f"{key}: {text}" for text in texts) if len(texts) <= MOST_OFFERED else ""
     raise fault("E203", node.location, subject, "a single value", form(node), fix)
+
+
+def _texts_in(node: Node) -> list[str]:
+    """Return the texts of the scalars directly in a list or mapping that are not empty."""
+    if isinstance(node, Scalar):
+        return []
+    items = node.items if isinstance(node, Sequence) else [value for _, value in node.entries]
+    return [item.text for item in items if isinstance(item, Scalar) and item.text.strip()]
 
 
 def list_of(node: Node, subject: str, size: int, item: str) -> tuple[Node, ...]:
     """Return the items of a list node with `size` items; `item` is an example for the message.
 
-    Raises E203.
+    Raises E203. The fix repeats the last value of the node, or omits the values that are too many.
     """
     if isinstance(node, Sequence) and len(node.items) == size:
         return node.items
     got = f"a list of {len(node.items)}" if isinstance(node, Sequence) else form(node)
-    fix = f"{subject}: [{', '.join([item] * size)}]"
+    texts = [node.text] if isinstance(node, Scalar) and node.text.strip() else _texts_in(node)
+    if isinstance(node, Mapping) or not texts:
+        texts = [item]
+    fix = f"{subject}: [{', '.join((texts + texts[-1:] * size)[:size])}]"
     raise fault("E203", node.location, subject, f"a list of {size} values", got, fix)
 
 
@@ -143,7 +168,7 @@ def name_of(
     """
     name = key.text
     if not IDENTIFIER.match(name):
-        expected = "a letter followed by letters, digits or underscores (63 at most)"
+        expected = "a letter, then letters, digits or _ (at most 63)"
         raise fault("E205", key.location, f"name of {subject}", expected, brief(name) or "nothing")
     if name in words:
         raise fault("E205", key.location, f"{name} is a reserved word and can't be a name")
@@ -214,7 +239,9 @@ class MappingReader:
         return result
 
 
-def unknown(code: str, location: SourceLocation, subject: str, name: str, texts: Collection[str]) -> ApcError:
+def unknown(
+    code: str, location: SourceLocation, subject: str, name: str, texts: Collection[str], prefix: str = ""
+) -> ApcError:
     """Return the error for an unknown name, with the nearest known name, or with a list of known names.
 
     Parameters
@@ -225,14 +252,14 @@ def unknown(code: str, location: SourceLocation, subject: str, name: str, texts:
         The name as written.
     texts
         The known names.
+    prefix
+        The text before a name in the fix.
     """
     close = nearest(name, texts)
     if len(equal := equally_near(name, close, texts)) > 1:
-        return fault(
-            code, location, f"{subject}; the nearest are {enumerated(equal)}", fix=", or ".join(equal)
-        )
+        return fault(code, location, subject, fix=", or ".join(prefix + text for text in equal))
     if close:
-        return fault(code, location, f"{subject}; the nearest is {close}", fix=close)
+        return fault(code, location, f"{subject}; the nearest is {close}", fix=prefix + close)
     listed = ", ".join(list(texts)[:12]) + (", …" if len(texts) > 12 else "")
     return fault(
         code, location, f"{subject}; available: {listed}" if listed else f"{subject}; none is defined"

@@ -11,6 +11,7 @@ columns computes them for each peer.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -48,6 +49,7 @@ from apc.compiler.source.reading import (
     list_of,
     mapping_of,
     name_of,
+    named,
     text_of,
     unknown,
     whole_number,
@@ -176,11 +178,22 @@ def _count(name: str, body: MappingReader, table: Table | None, computed: Scalar
         got += f", which is {float(computed.number):.12g}"
     if count is None or not 1 <= count <= LARGEST_COUNT:
         expected = f"a whole number from 1 to {LARGEST_COUNT}"
-        raise fault("E208", node.location, "count", expected, got, "count: 3")
+        raise fault("E208", node.location, "count", expected, got, _nearest_counts(node))
     if table is not None and table.rows != count:
         message = f"group {name} has a count of {count} and a table of {table.rows} rows"
         raise fault("E208", node.location, message, fix=f"count: {table.rows}")
     return count
+
+
+def _nearest_counts(node: Node) -> str:
+    """Return the fix for an invalid count: the nearest valid ones; empty if it is no number or too large."""
+    value = node.value if isinstance(node, Scalar) else None
+    if isinstance(value, bool) or not isinstance(value, int | float) or not value <= LARGEST_COUNT:
+        return ""
+    if value < 1:
+        return f"count: {-value}" if isinstance(value, int) and 1 <= -value <= LARGEST_COUNT else ""
+    counts = dict.fromkeys((math.floor(value), math.ceil(value)))
+    return ", or ".join(f"count: {count}" for count in counts)
 
 
 @dataclass(frozen=True, slots=True)
@@ -207,7 +220,7 @@ class GroupReader:
         mistakes, table = self.numbers.mistakes, group.table
         for key, node in self._entry_by_entry(group):
             with mistakes:
-                message = f"set: {brief(key.text)} is not a parameter or variable of a part"
+                message, whole = f"set: unknown name {named(key.text)}", f"set: {brief(key.text)} is a part"
                 if isinstance(node, MappingNode) and any(part.name == key.text for part in self.parts):
                     pairs = [
                         (parameter.text, scalar.text)
@@ -215,10 +228,9 @@ class GroupReader:
                         if isinstance(scalar, Scalar)
                     ]
                     fix = ", ".join(f"{key.text}.{name}: {value}" for name, value in pairs)
-                    raise fault("E206", key.location, message, fix=fix)
+                    raise fault("E206", key.location, f"{whole}, not a parameter", fix=fix)
                 if listed := [name for name in self.settable if name.startswith(f"{key.text}.")]:
-                    message = f"set: {brief(key.text)} is a part, not a parameter"
-                    raise unknown("E206", key.location, message, "", listed)
+                    raise unknown("E206", key.location, f"{whole}, not a parameter", "", listed)
                 item, qualified_names = self._settable(key.text, key.location, group.name, "E206", message)
                 if isinstance(item, Option | Reference):
                     words |= dict.fromkeys(qualified_names, self._word(node, key.text, item))
@@ -230,7 +242,7 @@ class GroupReader:
                     values |= dict.fromkeys(qualified_names, self.numbers.read_for(node, key.text, item))
         for column in () if table is None else table.columns:
             with mistakes:
-                message = f"heading {brief(column.name)} is not a parameter or variable of a part"
+                message = f"heading: unknown name {named(column.name)}"
                 item, qualified_names = self._settable(
                     column.name, column.location, group.name, "E702", message
                 )
@@ -314,7 +326,7 @@ class GroupReader:
             )
             if not nested and group.table is None and "count" not in group.body.nodes:
                 message = (
-                    f"group without a count: the list of {key.text}, a vector of {size}, does not define one"
+                    f"group {group.name} has no count, and {key.text} is one vector, not a list of vectors"
                 )
                 self.numbers.mistakes.add("E201", node.location, message, fix="count: 3")
             with self.numbers.mistakes:

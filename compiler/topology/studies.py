@@ -18,10 +18,10 @@ from apc.compiler.language.values import AlreadyReportedError, ScalarValue
 from apc.compiler.source.nodes import Mapping, Node, Scalar, Sequence
 from apc.compiler.source.reading import (
     MappingReader,
-    brief,
     fault,
     form,
     mapping_of,
+    named,
     text_of,
     unknown,
     whole_number,
@@ -102,18 +102,18 @@ def read_studies(
         `key` and `fix` are for messages.
         """
         if not (isinstance(span, Sequence) and len(span.items) == 2):
-            raise fault("E203", span.location, name.text, "a list of two values", form(span), fix)
+            raise fault("E203", span.location, name.text, "[min, max]", form(span), fix)
         known = {word: item for word, (item, _) in settable.items() if isinstance(item, NumberParameter)}
         if name.text not in known:
             if is_reported(name.text):
                 raise AlreadyReportedError
-            message = f"{key}: {brief(name.text)} is not a parameter of a part"
+            message = f"{key}: unknown parameter {named(name.text)}"
             raise unknown("E206", name.location, message, name.text, known)
         low, high = (numbers.read_for(item, name.text, known[name.text]) for item in span.items)
         if low.number >= high.number:
-            message = f"range of {name.text}"
             fix = f"{name.text}: [{high}, {low}]" if low.number > high.number else ""
-            raise fault("E207", span.location, message, "the lower end first", f"{low} to {high}", fix)
+            expected = "the lower end first" if fix else "two different ends"
+            raise fault("E207", span.location, name.text, expected, fix=fix)
         return low, high
 
     def axis(node: Node, key: str) -> Axis:

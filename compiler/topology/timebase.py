@@ -8,6 +8,7 @@ Does not: assign variables to clocks (see `equations.clocks`).
 from __future__ import annotations
 
 import contextlib
+import re
 from collections.abc import Container
 from dataclasses import dataclass, replace
 from fractions import Fraction
@@ -16,13 +17,14 @@ from functools import partial
 from apc.compiler.components.component import RESERVED
 from apc.compiler.errors import ApcError
 from apc.compiler.language.dimensions import SECOND
-from apc.compiler.language.values import AlreadyReportedError, ScalarValue
+from apc.compiler.language.values import AlreadyReportedError, ScalarValue, is_quantity
 from apc.compiler.number_parsing import plain_float
 from apc.compiler.source.nodes import Mapping, Node, Scalar
 from apc.compiler.source.reading import MappingReader, brief, fault, name_of
 from apc.compiler.topology.topology_parameters import NamedNumbers
 
 CLOCK = ("period", "phase")
+_NUMBER = re.compile(r"[0-9.]+")
 LIKE_A_RATE = 30  # a larger number without a unit is probably a rate in Hz, a smaller one a period in ms
 
 
@@ -75,22 +77,24 @@ def _read_clock(name: str, node: Node, numbers: NamedNumbers, root: MappingReade
             raise AlreadyReportedError
         period, phase = given_period, given_phase
     elif isinstance(node, Scalar) and type(node.value) in (int, float) and node.plain:
-        fix = f"{name}: 1 ms"
+        fix, expected, got = "", "a time or a rate, such as 1 ms or 1 kHz", brief(node.text)
         with contextlib.suppress(ValueError):  # YAML's other number formats are not valid for a rate
             if (size := plain_float(node.text)) > 0:
                 rates = f"{name}: {node.text} Hz", f"{name}: {node.text} ms"
                 fix = ", or ".join(rates if size > LIKE_A_RATE else reversed(rates))
-        raise fault("E204", node.location, name, "a time or a rate", f"{brief(node.text)} (no unit)", fix)
+                expected, got = "a time or a rate", f"{got} (no unit)"
+        raise fault("E204", node.location, name, expected, got, fix)
     else:
         period = _period(node, name, numbers)
     if period.number <= 0:
-        message, fix = f"period of clock {name}", f"{name}: 1 ms"
-        raise fault("E207", period.location, message, "more than 0 s", str(period), fix)
+        key = "period" if isinstance(node, Mapping) else name
+        fix = f"{key}: {str(period).removeprefix('-')}" if period.number and not period.expression else ""
+        raise fault("E207", period.location, f"period of {name}", "more than 0 s", str(period), fix)
     if not 0 <= phase.number < period.number:
-        expected = "at least 0 s and less than the period"
+        expected = "from 0 s to less than the period"
         phase_ms = f"{1000 * float(phase.number % period.number):.6g}"
         fix = f"phase: {phase_ms} ms" if float(phase_ms) < 1000 * float(period.number) else ""
-        raise fault("E207", phase.location, f"phase of clock {name}", expected, str(phase), fix)
+        raise fault("E207", phase.location, f"phase of {name}", expected, str(phase), fix)
     return ClockDeclaration(name, period, phase)
 
 
@@ -99,8 +103,10 @@ def _period(node: Node, subject: str, numbers: NamedNumbers) -> ScalarValue:
     try:
         return numbers.read_time(node, subject)
     except ApcError as error:
+        number = _NUMBER.match(node.text) if isinstance(node, Scalar) and is_quantity(node.text) else None
+        fix = f"{subject}: {number[0]} ms" if number else ""
         raise ApcError(
-            replace(mistake, expected="a time or a rate", fix=mistake.fix or f"{subject}: 1 ms")
+            replace(mistake, expected="a time or a rate", fix=mistake.fix or fix)
             if mistake.code == "E204" and mistake.expected == "ms"
             else mistake
             for mistake in error.mistakes

@@ -83,8 +83,8 @@ def read_count_by_names(node: Scalar, root: MappingReader) -> ScalarValue:
     numbers = read_named_numbers(root, {"": 1}, NamedFiles(Path(), Mistakes(), FileReader()))
     known = {*numbers.names, *numbers.faulty}
     if unknown := [word for word in _WORD.findall(node.text) if word not in known]:
-        expected = "a whole number, or an expression in dimensionless parameters"
-        raise fault("E208", node.location, "count", expected, brief(unknown[0]), "count: 3")
+        expected = "a whole number, or an expression in parameters"
+        raise fault("E208", node.location, "count", expected, brief(unknown[0]))
     count = numbers.read(node, "count", DIMENSIONLESS, "1")
     used, unvisited = set[tuple[str, ...]](), [count]
     while unvisited:
@@ -92,7 +92,7 @@ def read_count_by_names(node: Scalar, root: MappingReader) -> ScalarValue:
             new = {name.parts for name in names(tree)} - used
             if PEERS in new:
                 message = f"count {brief(node.text)} depends on peers, the sum of all counts"
-                raise fault("E208", node.location, message, fix="count: 3")
+                raise fault("E208", node.location, message)
             used |= new
             unvisited += (numbers.values[".".join(parts)] for parts in new)
     return count
@@ -181,7 +181,9 @@ class NamedNumbers:
             return self.read(node, subject, SECOND, unit)
         rate = self.read(node, subject, SECOND.power(-1), "Hz")
         if rate.number <= 0:
-            raise fault("E207", node.location, subject, "a rate above 0 Hz", brief(node.text))
+            fix = f"{subject}: {node.text.strip().removeprefix('-')}" if rate.number else ""
+            fix = "" if rate.expression else fix
+            raise fault("E207", node.location, subject, "a rate above 0 Hz", brief(node.text), fix)
         return ScalarValue(1 / rate.number, SECOND, None, rate.location)
 
     def read_for(self, node: Node, subject: str, item: Settable) -> ScalarValue:

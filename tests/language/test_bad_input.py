@@ -278,7 +278,7 @@ EACH = "peers: {user: {count: 3, set: {device.x: [0 m, 10 mm, 0 m]}}}"
         ),
         ("contact.stiffness", "E621 override: expected NAME=VALUE, got contact.stiffness."),
         ("contact.stiffness=-1 N/m", "E624 contact.stiffness: expected at least 0 N/m, got -1 N/m."),
-        ("contact.stiffness=9**9**9", "E222 unit: expected a name such as N, m or s, got ^."),
+        ("contact.stiffness=9**9**9", "E222 unit **9**9: expected a name, such as N, m or s, got ^."),
         ("haptic.period=0 s", "E625 haptic.period: expected a time above 0 s"),
         ("peers=4", "E623 peers is the number of all peers"),
         ("cube.mass=0 kg", "E624 cube.mass: expected more than 0 kg, got 0 kg."),
