@@ -223,8 +223,8 @@ def _with_inner_parts(
         """Return the parameters of the outer component with a role: clocks, links or tables."""
         return [p.name for p in outer.parameters if isinstance(p, Reference) and p.role == role]
 
-    names, context = [".".join(name) for name in dimensions], f"the parts of {outer.name}"
-    scope = EntryScope(dimensions.get, names, references, parts, context, outer=outer)
+    names = [".".join(name) for name in dimensions]
+    scope = EntryScope(dimensions.get, names, references, parts, outer=outer)
     inner = [
         Inner(name, part.component, read_entry(part, scope, mistakes, index), part.location)
         for part in parts.entries.values()

@@ -44,6 +44,7 @@ from apc.compiler.language.vectors import by_vector, sizes_of, whole_and_index, 
 from apc.compiler.source.nodes import Mapping as MappingNode
 from apc.compiler.source.nodes import Node, Scalar
 from apc.compiler.source.reading import (
+    IDENTIFIER,
     MappingReader,
     among,
     brief,
@@ -52,6 +53,8 @@ from apc.compiler.source.reading import (
     list_of,
     mapping_of,
     name_of,
+    named,
+    quoted,
     text_of,
     unknown,
     whole_number,
@@ -109,19 +112,25 @@ class Definitions(Protocol):
         """Return the connector type of a name, or None if there is none."""
 
 
-def component_named(name: str, location: SourceLocation, library: Definitions, fix: str) -> Component:
+def component_named(
+    name: str, location: SourceLocation, library: Definitions, fix: str, keys: Collection[str] = ()
+) -> Component:
     """Return the component of a name that is written at `location`.
 
-    Raises ApcError if there is no such component, or with the mistakes of its definition.
+    Raises ApcError if there is no such component, or with the mistakes of its definition. If `keys` are
+    given, a component that has all of them is proposed first.
     """
     component = library.component(name)
     if component is not None:
         return component
     if name in library.names:
         raise fault("E206", location, f"{name} is a connector type, not a component", fix=fix)
-    message, names = f"unknown component {brief(name)}", library.component_names
-    if close := _name_with_word(name, names):
-        raise fault("E206", location, f"{message}; the nearest is {close}", fix=close)
+    message, names = f"unknown component {named(name)}", library.component_names
+    fitting = _with_keys(library, {*keys}) if keys else {}
+    complete = [name for name, component in fitting.items() if _required(component) <= {*keys}]
+    for known in (complete, fitting, names):
+        if close := _name_with_word(name, known) or nearest(name, known):
+            raise unknown("E206", location, message, close, [close])
     raise unknown("E206", location, message, name, names)
 
 
@@ -136,6 +145,29 @@ def _name_with_word(word: str, names: Collection[str]) -> str:
         for at_start in (True, False)
     )
     return min(starting or containing, key=len, default="") if len(word) >= SHORTEST_WORD else ""
+
+
+def _keys(component: Component) -> set[str]:
+    """Return the keys of an entry that are defined by its component."""
+    items = (*component.parameters, *component.variables)
+    return {whole_and_index(item.name)[0] for item in items} | {*dict(component.connectors)}
+
+
+def _required(component: Component) -> set[str]:
+    """Return the names of the numbers and options of a component that have no default."""
+    items = (item for item in component.parameters if isinstance(item, NumberParameter | Option))
+    return {whole_and_index(item.name)[0] for item in items if item.default is None}
+
+
+def _with_keys(library: Definitions, keys: set[str]) -> dict[str, Component]:
+    """Return the components of a library whose entries can have some keys, by name."""
+    result = {}
+    for name in library.component_names:
+        with Mistakes():  # errors of a definition are reported when an entry uses it
+            component = library.component(name)
+            if component is not None and keys <= _keys(component):
+                result[name] = component
+    return result
 
 
 @dataclass(frozen=True, slots=True)
@@ -207,7 +239,8 @@ class PartEntries:
         if name is None:
             fix = fix if section == "parts" else f"type: {self._example(section, body, typical)}"
             raise fault("E201", key.location, f"{key.text} has no type", fix=fix)
-        return component_named(name, (node or key).location, self.library, fix)
+        keys = {*body.keys()} - {*PART_KEYS, "type"}
+        return component_named(name, (node or key).location, self.library, fix, keys)
 
     def _example(self, section: str, body: MappingNode, typical: str) -> str:
         """Return the component type to propose for an entry without a type.
@@ -215,15 +248,29 @@ class PartEntries:
         The type has all keys of the entry, and as few others as possible; `typical` is the section's most
         common type.
         """
-        keys, candidates = {*body.keys()} - {*PART_KEYS}, []
-        for name in self.library.component_names:
-            with Mistakes():  # errors of a definition are reported when an entry uses it
-                if (component := self.library.component(name)) is not None:
-                    connectors = {connector for connector, _ in component.connectors}
-                    known = connectors | {item.name for item in (*component.parameters, *component.variables)}
-                    if known >= keys and (section != "hands" or connectors == {"flange"}):
-                        candidates.append((name != typical, len(known), name))
+        candidates = [
+            (name != typical, len(_keys(component)), name)
+            for name, component in _with_keys(self.library, {*body.keys()} - {*PART_KEYS}).items()
+            if section != "hands" or {*dict(component.connectors)} == {"flange"}
+        ]
         return min(candidates, default=(True, 0, typical))[-1]
+
+    def missing_masses(self) -> str:
+        """Return the text of a section `masses` with the parts that entries are connected to and that are
+        missing; of one mass if there is none.
+        """
+        shared = {
+            node.text: entry.component.receives_from_others
+            for entry in self.entries.values()
+            for name, _ in entry.component.connectors
+            if isinstance(node := entry.body.get(name), Scalar) and IDENTIFIER.match(node.text)
+        }
+        missing = [name for name in shared if name not in {GROUND, *self.entries, *self.faulty}]
+        texts = {
+            name: "{mass: 0.1 kg, shared: true}" if shared[name] else "{mass: 0.1 kg}" for name in missing
+        }
+        name, example, _ = EXAMPLES["masses"]
+        return f"{{{', '.join(f'{name}: {text}' for name, text in (texts or {name: example}).items())}}}"
 
 
 def _count(name: str, section: str, body: MappingNode) -> int | None:
@@ -243,7 +290,7 @@ class EntryScope:
 
     `dimension` returns the dimension of a name in an expression, and `names` are these names; `references`
     returns the clocks, links or tables for a role and a word, or raises the error of their section; `parts`
-    are the parts that can be connected; `whole` is the text of the context in messages; `complete` is False
+    are the parts that can be connected; `complete` is False
     if a section of parts is missing or invalid, which was reported; `outer` is the enclosing component, None
     in a topology.
     """
@@ -252,7 +299,6 @@ class EntryScope:
     names: Collection[str]
     references: Callable[[str, str], Collection[str]]
     parts: PartEntries
-    whole: str
     complete: bool = True
     outer: Component | None = None
 
@@ -375,7 +421,11 @@ def read_entry(entry: PartEntry, scope: EntryScope, mistakes: Mistakes, index: i
                 connections.append((name, *target))
     targets = [(part, connector_type) for _, part, connector_type in connections if part != GROUND]
     if len(targets) > 1 and len(set(targets)) == 1:
-        mistakes.add("E210", entry.location, f"{entry.name} connects {targets[0][0]} to itself")
+        joined = [name for name, part, _ in connections if part != GROUND]
+        message = f"{enumerated(joined)} of {entry.name} are connected to the same part, {targets[0][0]}"
+        second = dict(component.connectors)[joined[1]]
+        fix = f"{joined[1]}: {next(iter(_free_parts(entry, scope, second.name)), GROUND)}"
+        mistakes.add("E210", nodes[joined[1]].location, message, fix=fix)
     return PartBindings(
         read_all(component.numbers, number),
         read_all((parameter for parameter in component.parameters if isinstance(parameter, Option)), option),
@@ -436,10 +486,8 @@ def _connection_target(
             f"{name}.{connector}" in other.words for other in parts.values()
         ):
             return None
-        free = (part for part in parts.values() if part.name not in {name, *entry.words})
-        fitting = (part.name for part in free if part.connectors(kind))
         message = f"connector {connector} of {name} is not connected"
-        fix = f"{connector}: {next(fitting, GROUND)}"
+        fix = f"{connector}: {next(iter(_free_parts(entry, scope, kind)), GROUND)}"
         for item in parts.values():  # an entry connected to the part without a named connector
             for key, value in item.body.entries:
                 if isinstance(value, Scalar) and value.text == name and key.text in item.connectors(kind):
@@ -451,24 +499,40 @@ def _connection_target(
     if outer is not None and text in dict(outer.connectors):
         return "", text
     if (result := _TARGET.match(text)) is None:
-        expected = "a part or connector, such as device, device.flange or chain[2]"
-        raise fault("E210", node.location, connector, expected, brief(text))
-    other, first, last, named = result.groups()
+        usable = _free_parts(entry, scope, kind)
+        known = [part.name for part in parts.values() if part.name in text.split()]
+        fix = f"{connector}: {known[0]}" if len(known) == 1 else ""
+        expected = f"the name of a part or connector, such as {next(iter(usable), 'device')}"
+        raise fault("E210", node.location, connector, expected, quoted(text), fix)
+    other, first, last, at_connector = result.groups()
     part = parts.get(other)
     if other in scope.parts.faulty or (part is None and not scope.complete):
         raise AlreadyReportedError
     if part is None:
-        message = f"{connector} of {name}: {brief(other)} is not a part of {scope.whole}"
+        message = f"{connector} of {name}: unknown part {brief(other)}"
         others = [part for part in parts.values() if part.name != name and part.connectors(kind)]
         names = [*(part.name for part in others), GROUND]
         if entry.component.receives_from_others:  # a coupler of copies: the objects only, shared ones first
             objects = [part for part in others if part.section == "masses"]
-            names = [part.name for part in [one for one in objects if one.is_shared] or objects]
+            names = [part.name for part in sorted(objects, key=lambda one: not one.is_shared)]
         raise unknown("E206", node.location, message, other, names)
-    if part.name == name and named is None and len(part.connectors(kind)) > 1:
+    if part.name == name and at_connector is None and len(part.connectors(kind)) > 1:
         raise fault("E210", node.location, f"{connector} of {name}", "another part", name)
     element = _element(part, first, last, entry, index, connector, node.location)
-    return element, _matching_connector(part, named, connector, kind, entry.section == "hands", node.location)
+    by_hand = entry.section == "hands"
+    return element, _matching_connector(part, at_connector, connector, kind, by_hand, node.location)
+
+
+def _free_parts(entry: PartEntry, scope: EntryScope, kind: str) -> list[str]:
+    """Return the names of the parts with a connector of a type that an entry does not name yet.
+
+    For an entry that receives from other peers, shared objects are first.
+    """
+    used = {entry.name, *entry.words}
+    free = [part for part in scope.parts.entries.values() if part.name not in used and part.connectors(kind)]
+    if entry.component.receives_from_others:
+        free.sort(key=lambda part: not part.is_shared)
+    return [part.name for part in free]
 
 
 def _element(
@@ -515,14 +579,15 @@ def _element(
         return f"{other}[{low + index - 1}]"
     else:
         mine = "a single part" if entry.count is None else f"an array of {entry.count}"
-        message = f"{entry.name} is {mine} and {other}[{low}:{high}] has {high - low + 1} elements"
+        theirs = f"{other}[{low}:{high}] has {high - low + 1} elements" if first else f"{other} has {size}"
+        message = f"{entry.name} is {mine}, but {theirs}{'' if first else ' elements'}"
         elements = f"1:{entry.count}" if entry.count and entry.count <= size else "1"
         fix = f'{connector}: "{other}[{elements}]"'
     raise fault("E210", at, message, fix=fix)
 
 
 def _matching_connector(
-    part: PartEntry, named: str | None, connector: str, kind: str, by_hand: bool, at: SourceLocation
+    part: PartEntry, written: str | None, connector: str, kind: str, by_hand: bool, at: SourceLocation
 ) -> str:
     """Return the connector of the connected part: the connector named, else the only one of the same type.
 
@@ -530,7 +595,7 @@ def _matching_connector(
     ----------
     part
         The part that is connected.
-    named
+    written
         The name of its connector, None if not written.
     connector, kind
         The connector of the entry, and its connector type.
@@ -546,8 +611,11 @@ def _matching_connector(
     """
     shown, fitting = f"{part.name} ({part.component.name})", part.connectors(kind)
     preferred = [name for name in fitting if (name in part.component.grips) == by_hand] or fitting
-    if named is not None:
-        return among(named, fitting, at, f"{shown} has no connector {{}} of type {kind}")
+    if written is not None:
+        if written in fitting:
+            return written
+        message = f"{shown} has no connector {written} of type {kind}"
+        raise unknown("E206", at, message, written, fitting, f"{part.name}.")
     if len(preferred) == 1:
         return preferred[0]
     message, fix = f"{connector}: expected a part with a connector of type {kind}, got {shown}", ""

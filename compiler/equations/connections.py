@@ -15,19 +15,20 @@ from apc.compiler.components.parts import GROUND
 from apc.compiler.errors import Mistakes, SourceLocation
 from apc.compiler.language.expression import Call, Expr, Name, NumberLiteral
 from apc.compiler.topology.instances import PartInstance
+from apc.compiler.wording import enumerated
 
 Terminal = tuple[str, str]  # (part, connector)
 ZERO = NumberLiteral(Fraction(0))
 
 
 def connection_equations(
-    parts: Sequence[PartInstance], mistakes: Mistakes
+    parts: Sequence[PartInstance], groups: Sequence[str], mistakes: Mistakes
 ) -> Iterator[tuple[Expr, Expr, SourceLocation]]:
     """Yield the equations (left, right, location) of each set of connected connectors.
 
     In each set the connector of a mass comes before the connectors connected to it. Connections to the ground
-    are separate sets: the ground connects nothing. A connection to a part that the peer does not have is
-    recorded.
+    are separate sets: the ground connects nothing. A connection to a part that the peers of `groups` do not
+    have is recorded.
     """
     by_name = {part.name: part for part in parts}
     connectors = {(part.name, name): type_ for part in parts for name, type_ in part.component.connectors}
@@ -52,8 +53,9 @@ def connection_equations(
             elif other in by_name:
                 merge((part.name, connector), (other, other_connector))
             else:
-                message = f"{part.name} is connected to {other}, but a group with {part.name} has no {other}"
-                advice = f"use the same groups in at: of {part.name} and {other}"
+                where = f"{'group' if len(groups) == 1 else 'groups'} {enumerated(groups)}"
+                message = f"{part.name} is connected to {other}, missing in {where}"
+                advice = "use the same at: for both"
                 mistakes.add("E210", part.location, message, advice=advice)
     for members in dict.fromkeys(map(tuple, set_of.values())):
         terminals = [terminal for terminal in members if terminal not in passed]

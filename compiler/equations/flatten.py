@@ -215,7 +215,7 @@ def flatten(topology: Topology, *, linear: bool = False) -> FlatSystem:
             if representative.name in part.groups
         ]
         peer_type = _flat_peer_type("", parts, mistakes, linear=linear)
-        connections = connection_equations(parts, mistakes)
+        connections = connection_equations(parts, [group.name for group in groups], mistakes)
         equations = (
             FlatEquation(left, right, CONNECTION, None, location) for left, right, location in connections
         )
@@ -435,9 +435,7 @@ class _PartWriter:
     def _report_unreduced(self, node: Name | Call) -> Expr:
         """Record the error E506 for values of the other peers outside of a reduction; return zero."""
         shown = format_expression(node)
-        message = (
-            f"{shown} of {self.part.name}: expected one value, got one value for each of the other peers"
-        )
+        message = f"{shown} of {self.part.name}: expected one value, got one for each other peer"
         self._report(
             "E506", node, message, fix=f"mean({shown}), or sum({shown}), or max({shown}), or min({shown})"
         )

@@ -215,8 +215,8 @@ def check_links(topology: Topology, peer_types: Sequence[PeerType], indices: Seq
         every = [channel for _, channels in sent for channel in channels]
         missing = ((name, text) for text in every for name, channels in sent if text not in channels)
         for name, channel in islice(missing, 1):
-            message = f"{channel} is sent over {link.name}, but the peers of {name} send other values over it"
-            advice = "use a separate link for values that only some groups send"
+            message = f"{channel} is sent over {link.name}, over which the peers of {name} send other values"
+            advice = "use a separate link for it"
             mistakes.add("E215", link.location, message, advice=advice)
     mistakes.raise_if_any()
     groups, counts = topology.groups, [group.count for group in topology.groups]
@@ -240,7 +240,7 @@ def check_links(topology: Topology, peer_types: Sequence[PeerType], indices: Seq
             f"{link.name}"
         )
         message = f"{receive}, so {used[first[0][0]]}() is undefined"
-        advice = f"add an arc to {'each' if len(deaf) > 1 else names[0]} in the graph"
+        advice = f"add an arc to {'each of them' if len(deaf) > 1 else names[0]}"
         receiving = np.bincount(owner[deaf], minlength=len(groups)) < counts
         if not receiving.all() and receiving.any():
             others = [group.name for group, receives in zip(groups, receiving, strict=True) if receives]

@@ -133,12 +133,12 @@ class PartReader:
         peers, peer_limit = sum(counts[group] for group in groups), component.peers
         subject = f"{name} ({component.name})"
         if component.receives_from_others and peers == 1:
-            message = f"{subject} receives from the other peers"
+            message = f"{name} receives from other peers"
             fix = f"at: [{', '.join(counts)}]" if len(counts) > 1 else f"{next(iter(counts))}: {{count: 2}}"
             mistakes.add("E208", entry.location, message, expected="at least 2 peers", got="1", fix=fix)
         if peer_limit and peers > peer_limit:
             expected, got = f"{peer_limit} peers", f"{peers:,}"
-            advice = f"set count: {peer_limit}, or use at: with groups that have {peer_limit} peers together"
+            advice = f"set count: {peer_limit}, or at: to groups of {peer_limit} peers in total"
             mistakes.add("E208", entry.location, subject, expected=expected, got=got, advice=advice)
         for index, element in enumerate(entries(name, entry.count or 0), 1):
             read = read_entry(entry, self.scope, mistakes, index)
@@ -206,7 +206,7 @@ class PartReader:
             advice = f"set at: [{', '.join(map(form, items)) or groups}] in {user}"
             raise fault("E211", node.location, message, advice=advice)
         if not (isinstance(node, Sequence) and items):
-            got = "an empty one" if isinstance(node, Sequence) else form(node)
+            got = "an empty list" if isinstance(node, Sequence) else form(node)
             raise fault("E203", node.location, "at", "a list of groups", got, f"at: [{groups}]")
         texts = []
         for item in items:
@@ -232,8 +232,8 @@ def _shared(entry: PartEntry) -> bool:
     if not (isinstance(node, Scalar) and node.plain and isinstance(node.value, bool)):
         raise fault("E203", node.location, "shared", "true or false", form(node), "shared: true")
     if node.value and not any(parameter.divided for parameter in entry.component.numbers):
-        message = f"shared has no effect on {entry.name} ({entry.component.name}): none of its parameters"
-        raise fault("E210", node.location, f"{message} is divided among the peers", advice="remove shared")
+        message = f"shared: no parameter of {entry.name} ({entry.component.name}) is divided among peers"
+        raise fault("E210", node.location, message, advice="remove shared")
     return node.value
 
 

@@ -81,13 +81,13 @@ def _redeclared_entry(
         message = f"the type of {entry.name} can't differ between groups, as it communicates over a link"
         raise fault("E210", node.location, message)
     if _connectors(new) != _connectors(old):
-        message = f"{key.text}: {new.name} can't replace {old.name}"
-        raise fault(
-            "E210",
-            node.location,
-            message,
-            *(f"the connectors {_connectors(component)}" for component in (old, new)),
-        )
+        pairs = ((new, old), (old, new))  # a component, and the one with a connector that it has not
+        texts = [
+            f"{one.name} has no connector {more}" for one, other in pairs if (more := _additional(other, one))
+        ]
+        other_order = ["the connectors have another order"]
+        message = f"{key.text}: {new.name} can't replace {old.name}: {enumerated(texts or other_order)}"
+        raise fault("E210", node.location, message)
     units = {number.name: number.unit for number in old.numbers}
     for number in new.numbers:
         before = units.get(number.name, number.unit)
@@ -119,8 +119,12 @@ def _redeclared_entry(
     return replace(entry, component=new, body=replace(entry.body, entries=tuple(body.values())))
 
 
-def _connectors(component: Component) -> str:
-    """Return the text that lists the connectors of a component, and the connectors that hands can grip."""
+def _connectors(component: Component) -> list[str]:
+    """Return the connectors of a component as texts, with the type, and whether hands can grip it."""
     grips = dict.fromkeys(component.grips, ", for hands")
-    named = (f"{name} ({kind.name}{grips.get(name, '')})" for name, kind in component.connectors)
-    return ", ".join(named) or "none"
+    return [f"{name} ({kind.name}{grips.get(name, '')})" for name, kind in component.connectors]
+
+
+def _additional(component: Component, other: Component) -> str:
+    """Return the text of the connectors of a component that another one has not; empty if there is none."""
+    return ", ".join(text for text in _connectors(component) if text not in _connectors(other))

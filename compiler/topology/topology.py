@@ -59,7 +59,7 @@ NESTED = (*SECTIONS, "clocks", "parameters", "peers", "experiment", "studies")
 REQUIRED = {
     "topology": "my-topology",
     "peers": "{user: {count: 3}}",
-    "masses": "{device: {mass: 0.1 kg}}",
+    "masses": "",  # by the objects of the couplers and hands
 }
 
 
@@ -144,7 +144,8 @@ def readable_library(
         fix = f"{key} {example}" if refused.why == "large" else ""
         if refused.why == "missing" and folder.is_file():
             message = f"library: expected a folder, got the file {brief(text)}"
-            fix = f"{key} {text.rpartition('/')[0] or '.'}"
+            parent = text.rpartition("/")[0] or "."
+            fix = f"{key} {parent}" if text.endswith((".yaml", ".yml")) else ""
         elif refused.why == "missing" and folder != Path(text):
             message += f" (paths are relative to the topology; searched: {folder})"
         raise fault("E214", location, message, fix=fix) from None
@@ -177,7 +178,8 @@ def build_topology(source: Source, library: Library) -> Topology:
             message = (
                 "the topology has no name" if key == "topology" else f"the topology has no {key} section"
             )
-            mistakes.add("E201", root.location, message, fix=f"{key}: {example}")
+            if example:
+                mistakes.add("E201", root.location, message, fix=f"{key}: {example}")
     bodies = read_counts(root, files)
     group_names = [key.text for key, _ in root.section("peers", "{user: {count: 3}}")]
     complete = len(bodies) == len(group_names)  # a group with an invalid count is included by name
@@ -188,11 +190,12 @@ def build_topology(source: Source, library: Library) -> Topology:
     sections = PartEntries(library, mistakes, {*numbers.values, *counts, *clocks})
     for section in SECTIONS:
         sections.read(section, root)
+    if "masses" not in root.nodes:
+        fix = f"masses: {sections.missing_masses()}"
+        mistakes.add("E201", root.location, "the topology has no masses section", fix=fix)
     names = _Names(root, sections, clocks, tuple(counts))
     entries = sections.entries
-    scope = EntryScope(
-        numbers.dimension, numbers.names, names.of_role, sections, "this topology", names.complete
-    )
+    scope = EntryScope(numbers.dimension, numbers.names, names.of_role, sections, names.complete)
     reader = PartReader(scope, numbers)
     redeclared_entries = redeclared(bodies.values(), sections)
     for entry in entries.values():
@@ -312,7 +315,7 @@ class _Names:
         if link in self.links:
             example = f"{link}: {{delays: {{{self.groups[0]}: {{{self.groups[-1]}: 12 ms}}}}}}"
             message = f"{name} belongs to a link and can't be set by a group"
-            advice = f"set the delay between two groups in links, as in {example}"
+            advice = f"set it in links, as in {example}"
             raise fault("E211", location, message, advice=advice if parameter == "delay" else "")
         if self.is_reported(name):
             raise AlreadyReportedError
