@@ -340,7 +340,7 @@ class ComponentNames:
             message = f"{self.component.name} does not send a value {sent}"
             mistakes.add("E303", location, message, fix=f"sends: {{{sent}: sample({self.example_of(sent)})}}")
         elif vector in self.dimensions:
-            expected, got, fix = "a vector before the index", f"{shown}, which is a number", shown
+            expected, got, fix = "a vector before the index", f"the number {shown}", shown
             if size:
                 expected, got, fix = f"an index from 1 to {size}", f"{index}", entry(shown, size)
             mistakes.add("E408", location, entry(shown, index), expected=expected, got=got, fix=fix)
@@ -415,5 +415,5 @@ def check_balance(component: Component) -> None:
     if len(component.equations) != len(unknowns):
         numbers = f"{counted(len(component.equations), 'equation')} for {counted(len(unknowns), 'unknown')}"
         message = f"{component.name} is unbalanced: {numbers} ({', '.join(unknowns) or 'none'})"
-        advice = "write one equation for each variable and one for each flow of a connector"
+        advice = "write one for each variable and each connector flow"
         raise fault("E501", component.location, message, advice=advice)

@@ -271,7 +271,7 @@ def _unit_and_size(body: MappingReader, name: str) -> tuple[Unit, int]:
     unit = body.read("unit", _unit, None)
     size = body.read("size", partial(_size, name=name, unit=unit.text if unit else "1"), 0)
     if unit is None and "unit" not in body.nodes:
-        fix, advice = f"{name}: {{unit: N/m}}", "use unit: 1 for a dimensionless parameter"
+        fix, advice = f"{name}: {{unit: N/m}}", "use unit: 1 for a plain number"
         raise fault("E201", body.location, f"{name} has no unit", fix=fix, advice=advice)
     if unit is None:
         raise AlreadyReportedError

@@ -107,6 +107,10 @@ def balanced(
     unmatched_rows, over, under, blocks = match(held, unknowns)
     if not (unmatched_rows or under[1]):
         return blocks
+    for name, equation in problem.cancelled.items():
+        if name in map(str, under[1]):
+            message = f"{name} cancels in `{equation.text}`, and no other equation determines it"
+            raise problem.fault("E502", [Residual(ZERO, equation)], message)
     parts = []
     (too_many, theirs), (holding, open_) = (
         ([residuals[i] for i in rows], [*map(str, some)]) for rows, some in (over, under)

@@ -13,7 +13,7 @@ of the other variables are ignored.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from operator import itemgetter
 
@@ -171,6 +171,8 @@ def _sorted_peer_type(peer_type: ClockedPeerType, divisors: Divisors, mistakes: 
                 Residual((left - right).xreplace(reductions), flat_equation)
                 for flat_equation, (left, right) in equation_sides
             ]
+            cancelled = _cancelled(residuals, part, lambda term: {s.name for s in term.free_symbols})
+            clock_problem = replace(clock_problem, cancelled=cancelled)
             steps = solve_blocks(residuals, [symbol(name) for name in part.variables], clock_problem)
             partitions.append(SortedPartition(part.clock, steps))
     states, aliases, steps, read = _sorted_continuous(
@@ -226,9 +228,16 @@ def _sorted_continuous(
     ]
     sides = _sides((*equations, *read_equations), time_varying.differentiate, problem)
     aliases = Aliases(time_varying, started)
-    residuals = aliases.remove(
-        [Residual(left - right, equation) for equation, (left, right) in zip(equations, sides, strict=False)]
+    residuals = [
+        Residual(left - right, equation) for equation, (left, right) in zip(equations, sides, strict=False)
+    ]
+    cancelled = _cancelled(
+        residuals,
+        peer_type.partitions[0],
+        lambda term: {name for name, _ in time_varying.derivatives(term).values()},
     )
+    problem = replace(problem, cancelled=cancelled)
+    residuals = aliases.remove(residuals)
     values = zip(read_equations, sides[len(equations) :], strict=True)
     read_residuals = [
         Residual(aliases.substitute(value), flat_equation) for flat_equation, (_, value) in values
@@ -277,6 +286,23 @@ def _sorted_continuous(
         steps,
         [aliases.shown(residual.expression) for residual in read_residuals],
     )
+
+
+def _cancelled(
+    residuals: Sequence[Residual], part: Partition, unknowns_of: Callable[[Term], set[str]]
+) -> dict[str, FlatEquation]:
+    """Return the unknowns of a partition that are in the text of an equation, but not in its residual.
+
+    `unknowns_of` returns the names of the unknowns in a term.
+    """
+    unknowns = {*part.variables}
+    result: dict[str, FlatEquation] = {}
+    for residual in residuals:
+        sides = (residual.equation.left, residual.equation.right)
+        written = {format_expression(name) for side in sides for name in names(side)}
+        for name in sorted(written & unknowns - unknowns_of(residual.expression)):
+            result.setdefault(name, residual.equation)
+    return result
 
 
 def _sides(

@@ -130,6 +130,10 @@ def _partitioned(peer_type: FlatPeerType, mistakes: Mistakes) -> ClockedPeerType
             if (given := clocks.given.get(hold.shown)) and (fix := _sampled_text(given)):
                 message = f"hold({held}): {held} must be sampled at a clock"
                 mistakes.add("E505", given.location, message, fix=fix)
+            elif clocks.is_undetermined(hold.variable):
+                message = f"hold({held}): {held} belongs to no clock"
+                advice = f"write sample() in the equations that determine {held}"
+                mistakes.add("E505", hold.location, message, advice=advice)
             else:
                 message = f"hold({held}): {held} is already continuous"
                 fix = next((_unheld_text(equation, held) for equation in holding), "")
@@ -194,6 +198,24 @@ def _local(text: str, equation: FlatEquation) -> str:
     return re.sub(rf"(?<![\w.])(others\.)?{re.escape(equation.origin)}\.", r"\1", text)
 
 
+def _converted_text(equation: FlatEquation, name: str, operator: str) -> str:
+    """Return the text of a part's equation with `operator`, sample or hold, applied to a name or call.
+
+    The result is empty if there is none.
+    """
+    written = equation.written
+    if written is None:
+        return ""
+
+    def converted(node: Expr) -> Expr | None:
+        """Return the conversion of the name or call, or None if a node remains."""
+        return Call(operator, (node,)) if format_expression(node) == name else None
+
+    right = transform(written.right, converted)
+    unchanged = right is written.right
+    return "" if unchanged else f"{format_expression(written.left)} = {format_expression(right)}"
+
+
 def _unheld_text(equation: FlatEquation, held: str) -> str:
     """Return the text of a part's equation without the hold of `held`; empty if there is none."""
     written = equation.written
@@ -237,6 +259,10 @@ class _Clocks:
         self._clocks = {
             clock: clock for clock in clock_names
         }  # the clock of each set that has one, by the root of the set
+        self._counts = [  # the number of variables in each equation
+            len({format_expression(leaf) for leaf in _leaves(equation)} & self.variables.keys())
+            for equation in peer_type.equations
+        ]
         self._reported: set[str] = set()  # parts whose clocked flow was reported
         receiving: dict[str, FlatEquation] = {}
         for index, equation in enumerate(peer_type.equations):
@@ -256,6 +282,19 @@ class _Clocks:
     def known_clock(self, name: str) -> str:
         """Return the clock of a name, empty if no clock is determined."""
         return self._clocks.get(self._root(name), "")
+
+    def is_undetermined(self, name: str) -> bool:
+        """Return whether a variable has no clock, and depends on no constant: each equation of the variables
+        that it depends on has at least two of them.
+        """
+        if self.known_clock(name):
+            return False
+        counts = [
+            count
+            for index, count in enumerate(self._counts)
+            if self._root(f"equation {index}") == self._root(name)
+        ]
+        return min(counts, default=0) > 1
 
     def check_start(self, name: str, location: SourceLocation) -> None:
         """Record the error E507 for `initial(x)` or `previous(x)` of a variable x without a start value."""
@@ -342,8 +381,8 @@ class _Clocks:
         for other in candidates if CONTINUOUS in (clock, other_clock) else ():
             if fix := _sampled_text(other):
                 message = (
-                    f"`{other.text}` of {other.origin} is on clock {other.clock} and needs sample() for "
-                    "continuous values"
+                    f"this equation of {other.origin} is on clock {other.clock}, so continuous values need "
+                    "sample()"
                 )
                 self.mistakes.add("E505", other.location, message, fix=fix)
                 return
@@ -351,12 +390,13 @@ class _Clocks:
         if CONTINUOUS in (clock, other_clock):
             advice = ""
             operator = "sample" if clock == CONTINUOUS else "hold"
-            fix = f"{operator}({_local(name, equation)})"
+            local = _local(name, equation)
+            fix = _converted_text(equation, local, operator) or f"{operator}({local})"
         words = [CONTINUOUS if text == CONTINUOUS else f"on clock {text}" for text in (clock, other_clock)]
-        message = (
-            f"in `{equation.text}` of {equation.origin}, {name} is {words[0]} but the other terms are "
-            f"{words[1]}"
-        )
+        message = f"{name} is {words[0]}, but the other terms of `{equation.text}` are {words[1]}"
+        if equation.written is not None:
+            shown = f"{_local(name, equation)} of {equation.origin}"
+            message = f"{shown} is {words[0]}, but the equation is {words[1]}"
         self.mistakes.add("E505", equation.location, message, fix=fix, advice=advice)
 
     def report_flow(self, name: str, given: FlatEquation) -> None:
@@ -364,5 +404,5 @@ class _Clocks:
         if given.origin not in self._reported and given.written is not None:
             self._reported.add(given.origin)
             left, right = format_expression(given.written.left), format_expression(given.written.right)
-            message = f"{name} is a continuous connector variable, but its value is on clock {self.of(name)}"
+            message = f"{name} is continuous, but its value is on clock {self.of(name)}"
             self.mistakes.add("E505", given.location, message, fix=f"{left} = hold({right})")

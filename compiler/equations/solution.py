@@ -9,8 +9,8 @@ Does not: solve anything (see `blt_solver`).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 from apc.compiler.equations.divisor_test import Divisors
 from apc.compiler.equations.flatten import FlatEquation
@@ -39,13 +39,14 @@ class Problem:
     """The context of a solution: the test of divisors, and the collector of errors.
 
     `where` is the name of the equations in messages; `location` is the location of errors without an
-    equation.
+    equation; `cancelled` has the unknowns that cancel in an equation, with this equation.
     """
 
     where: str
     location: SourceLocation
     divisors: Divisors
     mistakes: Mistakes
+    cancelled: Mapping[str, FlatEquation] = field(default_factory=dict)
 
     def fault(self, code: str, residuals: Sequence[Residual], message: str, advice: str = "") -> ApcError:
         """Return an error located at the first of some equations.
@@ -64,8 +65,8 @@ class Problem:
         """Return the error E512: equations with a constant that is not a number, possibly after
         substitution.
         """
-        holds = f"{listed(residuals)} contain{'s' if len(residuals) == 1 else ''} a constant that is"
-        return self.fault("E512", residuals, f"{holds} undefined or too large, such as 1/0 or sqrt(-1)")
+        holds = f"{listed(residuals)} {'has' if len(residuals) == 1 else 'have'} an undefined or too large"
+        return self.fault("E512", residuals, f"{holds} constant, such as 1/0 or sqrt(-1)")
 
     def no_derivative(self, residual: Residual, missing: NoDerivativeError) -> ApcError:
         """Return the error E508: the derivative of an equation is required, but a term has none."""

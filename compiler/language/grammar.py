@@ -61,6 +61,7 @@ _LOOKALIKES = {"−": "-", "–": "-", "×": "*", "·": "*", "⋅": "*", "÷": "
     "≤": "<=",
     "≥": ">=",
     "≠": "!=",
+    **dict(zip("асеорхуАВЕКМНОРСТХ", "aceopxyABEKMHOPCTX", strict=True)),  # Cyrillic letters
 }
 _UNEXPECTED = {
     "[": "an index is a whole number directly after its name, as in finger[2]",
@@ -169,20 +170,21 @@ def _refuse_character(text: str, at: int) -> NoReturn:
     """Raise ParseError (E321) for an invalid character, with a fix if there is a usual replacement."""
     character = text[at]
     if character in _UNEXPECTED:
-        raise ParseError("E321", at, f"unexpected {character}: {_UNEXPECTED[character]}")
-    got = character if character.isascii() and character.isprintable() else ""
-    if not got:
+        got = "quote" if character in "'\"" else character
+        raise ParseError("E321", at, f"unexpected {got}: {_UNEXPECTED[character]}")
+    got = ""
+    if not (character.isascii() and character.isprintable()):
         name = unicodedata.name(character, "unnamed character")
         got = f"{character if character.isprintable() else ''} (U+{ord(character):04X}, {name})".lstrip()
-    expected, fix = "ASCII letters, digits and + - * / ^ ( )", _LOOKALIKES.get(character, "")
-    raise ParseError("E321", at, "expression", expected, got, fix=fix)
+    fix = _LOOKALIKES.get(character, "")
+    raise ParseError("E321", at, f"unexpected character {got or repr(character)} in an expression", fix=fix)
 
 
 def _refuse_token(text: str, fault: UnexpectedToken) -> NoReturn:
     """Raise ParseError for a token that cannot follow the tokens on the parser's stack."""
     token, stack = fault.token, fault.state.value_stack
     if token.type == "$END":
-        token = Token("$END", "the end of the text", len(text))
+        token = Token("$END", "nothing", len(text))
     if token.type in ("NAME", "FUNCTION"):
         _check_name(token)
     got, at = "^" if token.type == "POWER" else cut(token), unclosed(stack)
@@ -199,7 +201,9 @@ def _refuse_token(text: str, fault: UnexpectedToken) -> NoReturn:
         if kinds[1:2] == ["COMMA"] and got == _CLOSERS[opener]:
             each = f"an argument of {called[:-1]}" if called else "an entry of a vector"
             raise ParseError("E322", token, f"{each} is missing after the comma")
-        raise ParseError("E322", token, f"expected a number, a name or (, got {got}")
+        after = text[: token.start_pos].rstrip()
+        subject = f"after {_last(after)}: " if after else ""
+        raise ParseError("E322", token, f"{subject}expected a number, a name or (, got {got}")
     if token.type == "POWER":
         raise ParseError("E326", token, "a power of a power needs parentheses, as in (x^2)^3")
     if kinds[1:2] == ["NUMBER"] and "POWER" not in kinds and kinds[0] in ("NAME", "FUNCTION", "NUMBER"):
@@ -231,6 +235,12 @@ def _refuse_token(text: str, fault: UnexpectedToken) -> NoReturn:
     if token in KEYWORDS:
         message = f"unexpected {token} without if … then … else"
     raise ParseError("E322", token, message)
+
+
+def _last(text: str) -> str:
+    """Return the call or the operator at the end of a text, for a message."""
+    match = re.search(r"\w*\(\Z|[^\w\s()]+\Z|\w+\Z", text)
+    return match[0] if match else cut(text)
 
 
 def _check(expr: Expr, text: str, depth: int = 1, *, conditional: bool = False) -> None:
@@ -363,7 +373,8 @@ class _Trees(TREE):
         function, _, *arguments, _ = parts
         least, most = FUNCTIONS[function]
         if not least <= len(arguments) <= most:
-            requested = f"{least}" if least == most else f"{least} to {most}"
+            joined = "or" if most == least + 1 else "to"
+            requested = f"{least}" if least == most else f"{least} {joined} {most}"
             plural = "argument" if most == 1 else "arguments"
             raise ParseError("E325", function, function, f"{requested} {plural}", f"{len(arguments)}")
         if function != "interval":

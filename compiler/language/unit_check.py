@@ -130,15 +130,11 @@ class _Checker:
         if not known:
             return None if any(dimension is None for _, dimension in pairs) else ANY
         typical = Counter(dimension for _, dimension in known).most_common(1)[0][0]
-        like = next(part for part, dimension in known if dimension == typical)
+        fitting = [part for part, dimension in known if dimension == typical]
+        others = "the other terms" if len(known) - 1 == len(fitting) > 1 else self.expression_text(fitting[0])
         for part, dimension in known:
             if dimension and typical and (dimension != typical or dimension.clashes(typical)):
-                self.add(
-                    code,
-                    part,
-                    f"{_dimension_text(typical)}, the unit of {self.expression_text(like)}",
-                    dimension,
-                )
+                self.add(code, part, f"{_dimension_text(typical)}, the unit of {others}", dimension)
         return typical
 
     def fits(self, expr: Expr, required: Dimension, code: str, expected: str) -> None:

@@ -143,14 +143,9 @@ class _VectorWriter:
     def __init__(self, size_of: SizeOf, text: str, location: SourceLocation) -> None:
         self.size_of, self.text, self.location = size_of, text, location
 
-    def fail(
-        self, code: str, at: Expr, expected: str, got: str = "", fix: str = "", within: str = ""
-    ) -> NoReturn:
-        """Raise an error located at a part of the expression; `within` is added to the text of the part."""
-        message, location = (
-            as_written(at, self.text) + within,
-            location_in(self.location, self.text, at.start),
-        )
+    def fail(self, code: str, at: Expr, expected: str, got: str = "", fix: str = "") -> NoReturn:
+        """Raise an error located at a part of the expression."""
+        message, location = as_written(at, self.text), location_in(self.location, self.text, at.start)
         raise ApcError(Diagnostic(code, location, message, expected, got, fix))
 
     def written(self, expr: Expr) -> Written:
@@ -175,8 +170,11 @@ class _VectorWriter:
             return self.product(expr)
         if word == "^":
             inner, power = map(format_expression, parts)
-            fix = f"dot({inner}, {inner})" if power == "2" else f"norm({inner})^{power}"
-            return self.each(expr, [(self.number(parts[0], fix),), parts[1:]])
+            base = self.written(parts[0]) or parts[:1]
+            if _is_vector(base):
+                fix = f"dot({inner}, {inner})" if power == "2" else f"norm({inner})^{power}"
+                self.fail("E407", expr, "a number before ^", _size(base), fix)
+            return self.each(expr, [base, parts[1:]])
         numbers, skipped = NUMBERS.get(word, ()), UNCHANGED.get(word, ())
         written = [
             (part,) if k in skipped else (self.number(part),) if k in numbers else self.written(part)
@@ -204,7 +202,8 @@ class _VectorWriter:
             if not _is_vector(written):
                 shown = [format_expression(part) for part in expr.arguments]
                 fix = {"norm": f"abs({shown[0]})", "dot": "*".join(shown)}.get(word, "")
-                self.fail("E407", argument, "a vector", "a number", fix, f" in {word}")
+                got = f"the number {as_written(argument, self.text)}"
+                self.fail("E407", expr, "a vector" if word == "norm" else "two vectors", got, fix)
             vectors.append(written)
         self.agree(expr.arguments, vectors)
 
@@ -221,11 +220,11 @@ class _VectorWriter:
         squares = (call("^", x, NumberLiteral(Fraction(2))) for x in a)
         return (call("sqrt", reduce(partial(call, "+"), squares)),)
 
-    def number(self, expr: Expr, fix: str = "") -> Expr:
+    def number(self, expr: Expr) -> Expr:
         """Return the expanded expression of a number. Raises E407 for a vector."""
         written = self.written(expr) or (expr,)
         if _is_vector(written):
-            self.fail("E407", expr, "a number", _size(written), fix or self.of_vector(expr))
+            self.fail("E407", expr, "a number", _size(written), self.of_vector(expr))
         return written[0]
 
     def agree(self, parts: Sequence[Expr], written: Sequence[Written]) -> None:
