@@ -17,6 +17,7 @@ from fractions import Fraction
 from apc.compiler.compiled import Clock, Model
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.multiples import common_divisor, common_multiple
+from apc.compiler.wording import enumerated
 from apc.linearization.linear_subsystem import LinearSubsystem
 from apc.timing.liveness import ReceptionPattern, live_holds
 
@@ -136,10 +137,10 @@ def _check_frame_length(
     """
     ticks = sum(frame // quanta for quanta in period_quanta.values())
     if ticks > MOST_TICKS:
-        clocks = ", ".join(f"{name} {float(value) * 1e3:.9g} ms" for name, value in period.items() if name)
+        clocks = [f"{name} {float(value) * 1e3:.9g} ms" for name, value in period.items() if name]
         message = (
-            f"the frame (common period of the clocks) is {float(frame * quantum):.6g} s with {ticks} ticks "
-            f"({clocks}); the limit is {MOST_TICKS}"
+            f"the frame (common period of {enumerated(clocks)}) is {float(frame * quantum):.6g} s with "
+            f"{ticks} ticks; the limit is {MOST_TICKS}"
         )
         fix, advice = "", "use periods that are simple multiples of each other"
         odd = max(system.clocks, key=lambda clock: period.get(clock.name, Fraction(0)).denominator)

@@ -168,7 +168,5 @@ def test_what_is_remembered_and_held_is_a_state_where_it_is_read(
 
 
 def test_clocks_that_hardly_ever_stand_as_before_are_refused_with_their_periods() -> None:
-    with pytest.raises(
-        ApcError, match=r"E805 the frame .common period of the clocks. is .*haptic 1.00003 ms"
-    ):
+    with pytest.raises(ApcError, match=r"E805 the frame .common period of haptic 1.00003 ms"):
         analyze(numeric_model(paper(haptic=Fraction(100003, 10**8))))
