@@ -265,9 +265,9 @@ def _sorted_continuous(
     for state in (state for state in states if state not in started):
         holder = next((equation for equation in equations if f"der({state})" in equation.text), equations[0])
         message = f"the state {state} (by `{holder.text}` of {holder.origin}) has no start value"
-        advice = f"write start: at {state.rpartition('.')[2]}"
+        advice = f"add start: 0 to the variable {state.rpartition('.')[2]}"
         if state.startswith("der("):
-            advice = f"write {state} = v, and start: at v"
+            advice = f"write {state} = v and add start: 0 to the variable v"
         problem.mistakes.add("E510", holder.location, message, advice=advice)
     shown = [Residual(aliases.shown(residual.expression), residual.equation) for residual in solving]
     steps = solve_blocks(shown, [aliases.shown(s) for s in unknowns], problem)

@@ -323,10 +323,7 @@ def with_rounded(topology: Topology, peer_type: PeerType, links: Sequence[Link])
         if count_of(link.name) in peer_type.parameters and link.graph.shape == "arcs":
             values = set(received_sums(link, topology.peers).tolist())
             if len(set(map(float, values))) < len(values):
-                message = (
-                    f"the weights of two peers over {link.name} add up to sums that differ by less than "
-                    "rounding"
-                )
+                message = f"two sums of weights over {link.name} differ by less than rounding"
                 raise ApcError(
                     Diagnostic(
                         "E217", locations[link.name], message, advice="use weights of at most 15 digits"

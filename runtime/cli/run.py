@@ -135,7 +135,8 @@ def _addresses(listen: str | None, to: tuple[str, ...], *, has_secret: bool):  #
     for text in to:
         name, equals, address = (item.strip() for item in text.partition("="))
         if not (equals and name):
-            expected, fix = "PEER=HOST:PORT", '--to "right[1]=192.0.2.7:5000"'
+            expected = "PEER=HOST:PORT"
+            fix = f'--to "right[1]={text}"' if ":" in text else f'--to "{text or "right[1]"}=192.0.2.7:5000"'
             raise ApcError(
                 Diagnostic("E971", SourceLocation("--to"), "address", expected, text[:80] or "nothing", fix)
             )

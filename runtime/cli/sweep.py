@@ -113,7 +113,7 @@ def _values(over: tuple[str, ...]) -> dict[str, str]:
                 Diagnostic("E880", SourceLocation("sweep"), "--over", "PATH=VALUES", text[:80], form)
             )
         if name in result:
-            raise ApcError(Diagnostic("E883", SourceLocation("sweep"), f"two --over of {name[:80]}"))
+            raise ApcError(Diagnostic("E883", SourceLocation("sweep"), f"--over {name[:80]} is given twice"))
         result[name] = values
     return result
 

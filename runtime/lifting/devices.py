@@ -109,9 +109,9 @@ def find_device(
     if not result:
         return None
     if len(result) > 1 and any(isinstance(item, Device) for item in result.values()):
-        return f"the device is not unique: {', '.join(result)} ({peer_type.name})"
+        return f"the device of {peer_type.name} is not unique: {', '.join(result)}"
     text = next(iter(result.values()))
-    return f"{text} ({peer_type.name})" if isinstance(text, str) else text
+    return f"{peer_type.name}: {text}" if isinstance(text, str) else text
 
 
 def _is_plain(subsystem: SubsystemJacobians) -> bool:

@@ -115,8 +115,9 @@ def channel_law(system: Model, link: Link, delay: Fraction) -> ChannelLaw:
     for group in system.groups:
         for parameter in group.values:
             if parameter.name in loss:
-                message = f"{parameter.name} belongs to a link and can't be set by {group.name}"
-                raise ApcError(Diagnostic("E891", SourceLocation(system.origin.topology), message))
+                message = f"{parameter.name} belongs to a link and can't be set by group {group.name}"
+                location = SourceLocation(system.origin.topology)
+                raise ApcError(Diagnostic("E891", location, message, advice="set it without a group"))
     value = {parameter.name: parameter.value for parameter in system.parameters}
     seconds = {timing.name: float(timing.value) for timing in system.timings}
     p, r, one_minus_h, one_minus_k = (value[name] for name in loss) if loss else (0.0, 1.0, 1.0, 0.0)

@@ -220,7 +220,7 @@ TOOL = (TOPOLOGIES / "two-handed-tool.yaml").read_text(encoding="utf-8")
         (AVERAGE, [1.0], "usr[2].device", r'--at "user\[2\].device"'),
         (ONE_MASS, [1.0], "", "E935 the topology has no clock; .* Use a coupler with a clock"),
         (BARE, [1.0], "", "E931"),
-        (TOOL, [1.0], "", r"E931 left is coupled to masses .*, so the device is not unique \(user\)\.$"),
+        (TOOL, [1.0], "", r"E931 user: left is coupled to masses .*, so the device is not unique\.$"),
         (users(3, 1200), [1.0], "", "E934"),
         (unlike(np.linspace(0.08, 0.13, 50), users(50, 300)), [1.0], "", "E933 .* 50 different peers"),
     ],
