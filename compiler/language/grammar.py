@@ -220,6 +220,8 @@ def _refuse_token(text: str, fault: UnexpectedToken) -> NoReturn:
                     f"for a variable {token}"
                 )
             fix = ("" if advice else product) if Fraction(number) else str(number)  # 0 has any unit
+            if fix == product and kinds[0] != "NUMBER":
+                message = f"expected * between {cut(number)} and {cut(token)}, got {cut(described)}"
             with contextlib.suppress(ValueError):
                 fix = str(int(described, 0))  # 0x10 is 16
                 advice = ""
