@@ -415,5 +415,5 @@ def check_balance(component: Component) -> None:
     if len(component.equations) != len(unknowns):
         numbers = f"{counted(len(component.equations), 'equation')} for {counted(len(unknowns), 'unknown')}"
         message = f"{component.name} is unbalanced: {numbers} ({', '.join(unknowns) or 'none'})"
-        advice = "write one for each variable and each connector flow"
+        advice = "write one equation for each"
         raise fault("E501", component.location, message, advice=advice)

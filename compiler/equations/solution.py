@@ -65,8 +65,8 @@ class Problem:
         """Return the error E512: equations with a constant that is not a number, possibly after
         substitution.
         """
-        holds = f"{listed(residuals)} {'has' if len(residuals) == 1 else 'have'} an undefined or too large"
-        return self.fault("E512", residuals, f"{holds} constant, such as 1/0 or sqrt(-1)")
+        holds = f"{listed(residuals)} {'has' if len(residuals) == 1 else 'have'}"
+        return self.fault("E512", residuals, f"{holds} an undefined or too large constant")
 
     def no_derivative(self, residual: Residual, missing: NoDerivativeError) -> ApcError:
         """Return the error E508: the derivative of an equation is required, but a term has none."""

@@ -103,7 +103,7 @@ def read_graph(node: Node, numbers: NamedNumbers) -> Graph:
                 if key == "edges":
                     first, second = sorted((sender + 1, receiver + 1))
                     message = f"the edge between peers {first} and {second} is given twice"
-                advice = "an edge has both directions: use arcs for single directions"
+                advice = "it has both directions; arcs have one"
                 reverse = (sender, receiver) not in result
                 raise fault("E213", pair.location, message, advice=advice if reverse else "")
             result[sender, receiver] = weight

@@ -251,7 +251,7 @@ def _refuse_nested_section(root: Mapping) -> None:
                 is_empty or (items and all(isinstance(item, Mapping) for _, item in items))
             ):
                 message = f"{key.text} is a section, not an entry of {section}"
-                advice = f"write {key.text} at the indentation of {section}"
+                advice = f"indent {key.text} like {section}"
                 raise fault("E202", key.location, message, advice=advice)
 
 
