@@ -57,6 +57,7 @@ from apc.compiler.source.reading import (
     quoted,
     text_of,
     unknown,
+    value_of,
     whole_number,
 )
 from apc.compiler.wording import enumerated
@@ -117,8 +118,21 @@ def component_named(
 ) -> Component:
     """Return the component of a name that is written at `location`.
 
-    Raises ApcError if there is no such component, or with the mistakes of its definition. If `keys` are
-    given, a component that has all of them is proposed first.
+    Parameters
+    ----------
+    name, location
+        The name, and its location.
+    library
+        The components.
+    fix
+        The fix for the name of a connector type.
+    keys
+        The keys of the entry: a component with all of them is proposed first.
+
+    Raises
+    ------
+    ApcError
+        E206 there is no such component, or with the mistakes of its definition.
     """
     component = library.component(name)
     if component is not None:
@@ -363,7 +377,7 @@ def read_entry(entry: PartEntry, scope: EntryScope, mistakes: Mistakes, index: i
         name, words, node = item.name, item.words, nodes.get(item.name)
         if node is None:
             return item.default
-        word = text_of(node, name, f"{name}: {words[0]}")
+        word = value_of(node, name, words[0])
         if word in words:
             return word
         close = _SYNONYMS.get(word.lower()) or nearest(word, words)
@@ -493,7 +507,7 @@ def _connection_target(
                 if isinstance(value, Scalar) and value.text == name and key.text in item.connectors(kind):
                     fix = f"{item.name}: {{{key.text}: {name}.{connector}}}"
         raise fault("E210", entry.location, message, fix=fix)
-    text = text_of(node, connector, f"{connector}: device")
+    text = value_of(node, connector, "device")
     if text == GROUND:
         return GROUND, ""
     if outer is not None and text in dict(outer.connectors):

@@ -25,7 +25,7 @@ from apc.compiler.language.unit_text import format_dimension, format_si
 from apc.compiler.language.units import COMMON, parse_quantity, parse_unit, quantity
 from apc.compiler.language.vectors import number_of
 from apc.compiler.source.nodes import Node, Scalar
-from apc.compiler.source.reading import brief, either_comma, fault, named, text_of, unknown
+from apc.compiler.source.reading import brief, either_comma, fault, named, unknown, value_of
 from apc.compiler.wording import with_unit
 
 PEERS = ("peers",)
@@ -162,7 +162,7 @@ def read_binding(
         E203 a node that is not a single value, E204 a unit of a wrong dimension, E206 for every unknown name;
         and the errors of `quantity`, `parse_expression` and `dimension_of`.
     """
-    text, location = text_of(node, subject, f"{subject}: 1 {unit}"), node.location
+    text, location = value_of(node, subject, f"1 {unit}".removesuffix(" 1")), node.location
     number, written_unit = dict(words).get(text), ""
     if number is None:
         _refuse_marks(text, location, subject)
@@ -304,7 +304,7 @@ def read_free(node: Node, subject: str, others: Collection[str]) -> ValueBinding
 
     `others` are the names of other numbers; the names in the expression are checked later.
     """
-    text, location = text_of(node, subject, f"{subject}: 2000 N/m"), text_location(node)
+    text, location = value_of(node, subject, "2000 N/m"), text_location(node)
     if not is_quantity(text):
         return ValueBinding(None, _tree(text, location), DIMENSIONLESS, location)
     _refuse_trailing(text, location, subject, others)

@@ -1,8 +1,8 @@
 """Reading of typed values from YAML nodes; a node of the wrong type raises an error with a fix.
 
 Takes: nodes of the stage `source`. Gives: `MappingReader`, a mapping that is read key by key; `mapping_of`,
-`list_of`, `text_of`, `name_of`, `whole_number`, `among`; for messages `fault`, `unknown`, `form`, `brief`,
-`named`, `either_comma`.
+`list_of`, `text_of`, `value_of`, `name_of`, `whole_number`, `among`; for messages `fault`, `unknown`, `form`,
+`brief`, `named`, `quoted`, `either_comma`.
 Guarantees: a node of the wrong form is one mistake, an `ApcError` that `with mistakes:` records, so that
 the following nodes are read.
 Does not: handle sections, components or units.
@@ -106,16 +106,20 @@ def mapping_of(node: Node, subject: str, fix: str = "") -> Mapping:
 
 
 def text_of(node: Node, subject: str, fix: str = "") -> str:
-    """Return the text of a scalar that is not empty; arguments and error as for `mapping_of`.
-
-    The fix for a list or mapping has its values instead of that of the example `fix`.
-    """
+    """Return the text of a scalar that is not empty; arguments and error as for `mapping_of`."""
     if isinstance(node, Scalar) and node.text.strip() and node.value is not None:
         return node.text
-    key, colon, _ = fix.partition(": ")
-    if colon and (texts := list(dict.fromkeys(_texts_in(node)))):
-        fix = ", or ".join(f"{key}: {text}" for text in texts) if len(texts) <= MOST_OFFERED else ""
     raise fault("E203", node.location, subject, "a single value", form(node), fix)
+
+
+def value_of(node: Node, key: str, example: str) -> str:
+    """Return the text of the value of a key, as `text_of`.
+
+    The fix has the values of a list or mapping that was written instead, else the example.
+    """
+    values = list(dict.fromkeys(_texts_in(node))) or [example]
+    fix = ", or ".join(f"{key}: {value}" for value in values) if len(values) <= MOST_OFFERED else ""
+    return text_of(node, key, fix)
 
 
 def _texts_in(node: Node) -> list[str]:

@@ -50,8 +50,8 @@ from apc.compiler.source.reading import (
     mapping_of,
     name_of,
     named,
-    text_of,
     unknown,
+    value_of,
     whole_number,
 )
 from apc.compiler.topology.instances import PartInstance, SettableNames
@@ -340,7 +340,7 @@ class GroupReader:
         role, known = (
             ("option", declaration.words) if isinstance(declaration, Option) else ("clock", self.clocks)
         )
-        word = text_of(node, subject, f"{subject}: {next(iter(known), 'name')}")
+        word = value_of(node, subject, next(iter(known), "name"))
         return among(word, known, node.location, f"{subject}: unknown {role} {{}}")
 
     def _per_peer_values(
