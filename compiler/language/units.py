@@ -83,6 +83,24 @@ kHz 1000 s^-1 Hz
 kg*m^2 1 kg*m^2
 N/m^(3/2) 1 kg*m^-1/2*s^-2
 N*s/m^(5/2) 1 kg*m^-3/2*s^-1
+A 1 A
+K 1 K
+mol 1 mol
+cd 1 cd
+N*s 1 kg*m*s^-1
+N/m^2 1 kg*m^-1*s^-2
+N*s^2/m^2 1 kg*m^-1
+N*s/m^2 1 kg*m^-1*s^-1
+N/s 1 kg*m*s^-3
+m/N 1 kg^-1*s^2
+m/s^3 1 m*s^-3
+m^2 1 m^2
+m^3 1 m^3
+1/s^2 1 s^-2
+W 1 kg*m^2*s^-3
+V 1 A^-1*kg*m^2*s^-3
+N*m/A 1 A^-1*kg*m^2*s^-2
+rad/s^2 1 s^-2 rad
 """
 
 # Common units, which are proposed for a misspelled name or a name in the wrong case.
