@@ -144,6 +144,7 @@ class SmoothSegment:
     values. `sample_at` returns the eigenvalues (k, n) and their slopes (k, n) at values (k,), NaN if
     undefined; `verdict_at` the verdict of an analysis at a value. `slow`: each value is expensive.
     `decided_at` returns the verdicts at several values that one evaluation decides, None for the others.
+    `quick_at` returns the verdict at a value where samples have no slopes, and are moved off the circle.
     """
 
     low: Fraction
@@ -154,6 +155,7 @@ class SmoothSegment:
     verdict_at: Callable[[Fraction], Verdict]
     slow: bool = False
     decided_at: Callable[[Sequence[Fraction]], Sequence[Verdict | None]] | None = None
+    quick_at: Callable[[Fraction], Verdict] | None = None
 
     def verdicts_at(self, first: Fraction, second: Fraction) -> tuple[Verdict, Verdict]:
         """Return the verdicts at two values; the second one is undecided if the first one is.
@@ -542,9 +544,9 @@ def _crossing_between(
     half_width
         Half the width of the first bracket, relative to the value.
     """
-    value = _crossing_in_floats(segment, ends, log_radii, half_width)
+    value, uncertainty = _crossing_in_floats(segment, ends, log_radii, half_width)
     side = "below" if rising else "above"
-    width = half_width * (abs(value) or ends[1] - ends[0])
+    width = max(half_width * (abs(value) or ends[1] - ends[0]), uncertainty)
     low, high = limits
     for _ in range(TRIES):
         left, right = max(value - width, low), min(value + width, high)
@@ -710,8 +712,9 @@ def shortest_decimal(low: float, high: float) -> Fraction:
 
 def _crossing_in_floats(
     segment: SmoothSegment, ends: Sequence[float], log_radii: Sequence[float], tolerance: float
-) -> float:
-    """Return the value between two ends at which the spectral radius in floats crosses 1.
+) -> tuple[float, float]:
+    """Return the value between two ends at which the spectral radius in floats crosses 1, and how far it may
+    be off because verdicts near it are undecided.
 
     By Newton's method, or by Brent's method if Newton's leaves the ends or slopes are missing.
 
@@ -728,7 +731,11 @@ def _crossing_in_floats(
 
     def log_radius_at(value: float) -> tuple[float, float]:
         """Return the logarithm of the spectral radius at a value, and its slope."""
-        if value not in cached:
+        if value not in cached and segment.quick_at is not None:
+            verdict = segment.quick_at(Fraction(value))
+            undecided = verdict.stable is None or not verdict.radius > 0
+            cached[value] = 0.0 if undecided else math.log(verdict.radius), math.nan
+        elif value not in cached:
             result = _samples_at(segment, np.array([value]))
             if len(result.points):
                 largest = np.argmax(np.abs(result.values[0]))
@@ -746,13 +753,13 @@ def _crossing_in_floats(
         if not low <= next_value <= high:
             break
         if abs(next_value - value) <= tolerance * abs(next_value):
-            return next_value
+            return next_value, 0.0
         value = next_value
     # Imported where Newton's method fails: the import takes as long as an analysis.
     brentq = load_pool("scipy.optimize").brentq
     root_tolerance = tolerance / 100
     # If the method ends early, for example between adjacent floats, verdicts use the last bracket.
-    return float(
+    root = float(
         brentq(
             lambda value: log_radius_at(value)[0],
             low,
@@ -763,3 +770,10 @@ def _crossing_in_floats(
             disp=False,
         )
     )
+    if segment.quick_at is None or log_radius_at(root)[0]:
+        return root, 0.0
+    # By the slope to the nearest decided value.
+    decided = [point for point, (log_radius, _) in cached.items() if log_radius]
+    nearest = min(decided, key=lambda point: abs(point - root))
+    error = segment.quick_at(Fraction(root)).error
+    return root, error * abs(nearest - root) / abs(cached[nearest][0])

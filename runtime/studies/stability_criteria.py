@@ -321,7 +321,10 @@ class PointwisePath(SingleSegment):
         """Yield the one segment of the path."""
         low, high = Fraction(self.points[0]), Fraction(self.points[-1])
         sample_at = partial(pointwise, self._quick_verdict)
-        yield SmoothSegment(low, high, self.points, self.least, sample_at, self.verdict_at, slow=True)
+        quick_at = self._quick_verdict
+        yield SmoothSegment(
+            low, high, self.points, self.least, sample_at, self.verdict_at, slow=True, quick_at=quick_at
+        )
 
 
 def line_points(
