@@ -18,6 +18,9 @@ from .api import (
     bench as bench,
 )
 from .api import (
+    changing_counts as changing_counts,
+)
+from .api import (
     compare as compare,
 )
 from .api import (
@@ -101,6 +104,7 @@ from .api import (
 from .benchmark.speed_and_error import Bench as Bench
 from .compiler.compiled import Model as Model
 from .compiler.errors import ApcError as ApcError
+from .extensions.changing_counts.joins_and_leaves import ChangingCounts as ChangingCounts
 from .extensions.event_order.coincident_events import EventOrder as EventOrder
 from .extensions.paper_method.lifted_matrices import PaperMethod as PaperMethod
 from .extensions.pareto_front.trade_off import Design as Design

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from apc.analysis.contact_modes import ContactModes
     from apc.analysis.methods import Method
     from apc.benchmark.speed_and_error import Bench
+    from apc.extensions.changing_counts.joins_and_leaves import ChangingCounts
     from apc.extensions.event_order.coincident_events import EventOrder
     from apc.extensions.paper_method.lifted_matrices import PaperMethod
     from apc.extensions.pareto_front.trade_off import ParetoFront
@@ -491,6 +492,51 @@ def sensitivities(model: TopologySource, *, params: Values | None = None) -> Sen
     from apc.studies import sensitivity
 
     return sensitivity.sensitivities(_numeric(model, params))
+
+
+@checked
+def changing_counts(model: TopologySource, counts: str, *, params: Values | None = None) -> ChangingCounts:
+    """Return the stability of a model while users join and leave.
+
+    Stability for every number of peers is not stability through changes of the number.
+
+    Parameters
+    ----------
+    model, params
+        As for `analyze`.
+    counts
+        The number of peers of a group and its values: "user.count=2:10", or "user.count=2, 4".
+
+    Returns
+    -------
+    The verdict under arbitrary changes, otherwise a proved sufficient time between changes in seconds
+    (`dwell_s`), and counts of successive frames under which motions grow (`sequence`). A peer that joins
+    starts at the mean of the others; changes happen at the starts of frames.
+
+    Raises
+    ------
+    ApcError
+        E881 invalid values; E890 a parameter that is no number of peers, or peers that are not
+        interchangeable; E882 the extension is not installed, E875 cvxpy is not.
+
+    Notes
+    -----
+    A common quadratic function by a semidefinite program, verified with all rounding; dwell times by Geromel
+    and Colaneri, SIAM Journal on Control and Optimization 45, 2006.
+
+    Examples
+    --------
+    >>> import apc
+    >>> result = apc.changing_counts("three-users-average.yaml", "user.count=2:5")
+    >>> result.verdict, result.sequence, result.dwell_frames
+    ('unstable under a sequence of changes', (5, 5, 2), 12)
+    """
+    from apc.network.nominal_criterion import unreliable
+
+    numeric = _numeric(model, params)
+    extension = require_extension("changing_counts")
+    result: ChangingCounts = extension.changing_counts(numeric, counts, lossy=bool(unreliable(numeric.model)))
+    return result
 
 
 @checked

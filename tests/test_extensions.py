@@ -25,6 +25,7 @@ GAIN = '--free "coordination.stiffness=10 N/m:5000 N/m"'
 
 # A command that asks the question of each extension.
 QUESTIONS = {
+    "changing_counts": f"analyze {AVERAGE} --changing user.count=2:3",
     "event_order": f"analyze {AVERAGE} --event-order",
     "loss_models": f"simulate {TOPOLOGIES / 'lossy-average.yaml'} --trace-of worst --duration '0.1 s'",
     "paper_method": f"analyze {AVERAGE} --method paper",

@@ -21,6 +21,7 @@ from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 if TYPE_CHECKING:
     from apc.compiler.compiled import Model
     from apc.parameter_values.parameter_names import Range
+    from apc.result import Result
 
 # Of peers that all differ, by the thousand: 100,000 took 9 s on one core of 2026.
 SECONDS_A_PEER = 1e-4
@@ -44,6 +45,9 @@ def analyze_command(
         "N",
         type=click.IntRange(min=1),
         show_default="some seconds of work",
+    ),
+    changing: str | None = option(
+        "Analyze changes of a number of peers, e.g. user.count=2:10.", "PATH=COUNTS"
     ),
     every_convention: bool = option("Repeat for every order of simultaneous events.", name="--event-order"),
     margins: bool | None = option(
@@ -94,6 +98,9 @@ def analyze_command(
         return
     if hands not in HANDS:  # one of the library: all that were measured
         box = (*box, *(f"{name}={low}:{high}" for name, (low, high, _) in published(hands).items()))
+    if changing is not None:
+        print_result(_changing_counts(system, changing), as_json=as_json)
+        return
     ranges = _ranges(system, box)
     listed = sum(group.count for group in system.groups if group.columns)
     with at_work(f"analyzing {system.peers:,} peers", about=SECONDS_A_PEER * listed):
@@ -113,6 +120,17 @@ def analyze_command(
 
         write_picture(result.analysis.plot, plot)
     print_result(result, as_json=as_json, written=[plot])
+
+
+def _changing_counts(system: Model, changing: str) -> Result:
+    """Return the stability while the number of peers changes."""
+    from apc.lifting.numeric_model import numeric_model
+    from apc.network.nominal_criterion import unreliable
+    from apc.support.extension_table import require_extension
+
+    extension, lossy = require_extension("changing_counts"), bool(unreliable(system))
+    result: Result = extension.changing_counts(numeric_model(system), changing, lossy=lossy)
+    return result
 
 
 def _ranges(system: Model, box: tuple[str, ...]) -> list[Range]:

@@ -46,6 +46,13 @@ EXTENSIONS = {
     extension.name: extension
     for extension in (
         Extension(
+            "changing_counts",
+            "stability while users join and leave",
+            "--changing; apc.changing_counts",
+            ("joins_and_leaves:changing_counts",),
+            "changing_counts_output",
+        ),
+        Extension(
             "event_order",
             "the verdict under every order of simultaneous events",
             "every analysis; all orders with --event-order",

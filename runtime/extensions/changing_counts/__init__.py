@@ -1,0 +1,1 @@
+"""Stability while users join and leave."""

@@ -1,0 +1,126 @@
+"""Users who join and leave: against all peers of the paper's topology, stepped by hand."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import apc
+from apc.compiler.errors import ApcError
+from tests.bruteforce import TopologySource, frame_matrix
+from tests.commands import Cli
+from tests.topologies import TOPOLOGIES
+
+pytestmark = pytest.mark.needs_extension("changing_counts")
+
+Floats = NDArray[np.float64]
+AVERAGE, MESH = TOPOLOGIES / "three-users-average.yaml", TOPOLOGIES / "three-users-mesh.yaml"
+
+
+def source(operator: str, peers: int) -> TopologySource:
+    """Return the topology of three-users-average, or of the mesh, with another number of peers."""
+    return TopologySource(operator, peers, kt=500.0, cube=0.6 / peers)
+
+
+def all_peers(operator: str, peers: int) -> Floats:
+    """Return the frame matrix of all peers, peer by peer."""
+    return np.array(frame_matrix(source(operator, peers)))
+
+
+def deviation(matrix: Floats, peers: int) -> Floats:
+    """Return the map of d over a frame, for deviations d and -d of the first two peers."""
+    size = len(matrix) // peers
+    return matrix[:size, :size] - matrix[:size, size : 2 * size]
+
+
+def test_a_sequence_that_grows_does_so_for_all_peers() -> None:
+    """Two peers stay; the others join at their mean, and leave two frames later."""
+    found = apc.changing_counts(AVERAGE, "user.count=2:5")
+    assert found.verdict == "unstable under a sequence of changes" and sorted(found.sequence) == [2, 5, 5]
+    steps = {count: all_peers("mean", count) for count in (2, 5)}
+    product = np.eye(len(steps[2]) // 2)
+    for count in found.sequence:
+        product = deviation(steps[count], count) @ product
+    radius = abs(np.linalg.eigvals(product)).max()
+    assert found.growth == pytest.approx(radius ** (1 / 3), rel=1e-10)
+    assert all(apc.analyze(AVERAGE, params={"user.count": count}).stable for count in range(2, 6))
+
+
+def changed(state: Floats, count: int, rng: np.random.Generator) -> Floats:
+    """Return the states (n, s) of another number of peers: at random who leaves; who joins is at the mean."""
+    while len(state) > count:
+        state = np.delete(state, rng.integers(len(state)), axis=0)
+    return np.vstack([state, *[state.mean(axis=0)] * (count - len(state))])
+
+
+@pytest.mark.parametrize(("counts", "frames"), [("2:3", 1), ("3:4", 1), ("2:5", 12)])
+def test_under_any_changes_that_are_rare_enough_all_peers_come_to_rest(counts: str, frames: int) -> None:
+    found = apc.changing_counts(AVERAGE, f"user.count={counts}")
+    assert (found.dwell_frames or 1) == frames
+    steps = {count: all_peers("mean", count) for count in found.counts}
+    rng, count = np.random.default_rng(0), found.counts[0]
+    state = rng.standard_normal((count, len(steps[count]) // count))
+    for _ in range(400):
+        count = int(rng.choice(found.counts))
+        state = changed(state, count, rng)
+        for _ in range(frames):
+            state = (steps[count] @ state.ravel()).reshape(state.shape)
+    assert abs(state[:, 1]).max() < 1e-6 * abs(state[:, 0]).max()  # velocities; positions have a common one
+    assert np.ptp(state[:, 0]) < 1e-6
+
+
+@pytest.mark.parametrize("operator", ["mean", "sum"])
+def test_products_up_to_eight_frames_agree_with_the_verdict(operator: str) -> None:
+    """All sequences of up to eight numbers from 2 to 4 by brute force."""
+    found = apc.changing_counts(AVERAGE if operator == "mean" else MESH, "user.count=2:4")
+    steps = {count: deviation(all_peers(operator, count), count) for count in (2, 3, 4)}
+    stack, length, growth = np.array([np.eye(len(steps[2]))]), 0, 0.0
+    for length in range(1, 9):
+        stack = np.concatenate([step @ stack for step in steps.values()])
+        growth = max(growth, float((abs(np.linalg.eigvals(stack)).max(axis=1) ** (1 / length)).max()))
+    if found.verdict == "stable under arbitrary changes":
+        assert growth < 1
+    if found.sequence:
+        assert 1 < found.growth <= growth * (1 + 1e-9)
+    else:
+        assert growth < 1
+
+
+def test_a_number_that_is_unstable_alone_is_named() -> None:
+    found = apc.changing_counts(MESH, "user.count=2:6")
+    assert found.verdict == "unstable under a sequence of changes"
+    assert len(found.sequence) == 1 and not apc.analyze(MESH, params={"user.count": found.sequence[0]}).stable
+    assert found.dwell_frames is None and "unstable with user.count" in str(found)
+
+
+BAD = {
+    "contact.stiffness=2 N/m:3 N/m": r"E890 .*, got contact.stiffness. Try: .*user.count=2:10",
+    "user.count": r"E890 changing count: expected NAME=LOW:HIGH, got user.count",
+    "user.count=5:2": r"E881 range of user.count: expected the lower end first",
+    "user.count=2:2.5": r"E881 range of user.count: expected whole numbers",
+    "user.count=2:100": r'E890 user.count: expected at most 40 counts, got 99. Try: .* "user.count=2:41"',
+    "user.count=1:3": r"E8|E6",
+    "people=2:3": r"E622 people",
+}
+
+
+@pytest.mark.parametrize("text", BAD)
+def test_bad_counts_are_refused(text: str) -> None:
+    with pytest.raises(ApcError, match=BAD[text]):
+        apc.changing_counts(AVERAGE, text)
+
+
+def test_peers_in_a_ring_are_not_interchangeable() -> None:
+    with pytest.raises(ApcError, match=r"E890 .*equal peers that all receive each other"):
+        apc.changing_counts(TOPOLOGIES / "ring-of-eight.yaml", "user.count=7:8")
+
+
+def test_the_command_prints_text_and_json(cli: Cli, tmp_path: Path) -> None:
+    printed = cli("analyze", str(AVERAGE), "--changing", "user.count=2:3")
+    assert printed.code == 0 and "stable under arbitrary changes" in printed.out
+    assert max(map(len, printed.out.splitlines())) <= 80
+    told = cli("analyze", str(AVERAGE), "--changing", "user.count=2:5", "--json")
+    assert '"dwell_s": 0.096' in told.out
