@@ -33,6 +33,7 @@ FREE = '--free "coordination.stiffness=10 N/m:1000 N/m" --maximize coordination.
 AXES = '--x "contact.stiffness=1000 N/m:2000 N/m" --y "coordination.stiffness=400 N/m:500 N/m"'
 COMMANDS = {
     "apc analyze": [f"{AVERAGE} --event-order {BOX}", f"{LOSSY}"],
+    "apc analyze --changing": [f"user.count=2:3 {AVERAGE}", f"user.count=2:5 {AVERAGE}"],
     "apc analyze --hands passive": [f"{AVERAGE}"],
     "apc critical": [f"contact.stiffness {AVERAGE}", f"contact.stiffness {LOSSY}"],
     "apc region": [f"{AVERAGE} {AXES}"],
