@@ -1,7 +1,7 @@
 """A peer type's functions as expressions of Modelica.
 
 Takes: a `casadi.Function` of scalar operations, and the names of its inputs.
-Gives: `Text`, `number`, `identifier`, `unit_of_modelica`; `written`.
+Gives: `Text`, `number`, `identifier`, `unit_of_modelica`; `result_texts`.
 Guarantees: parentheses only where Modelica's precedence requires them; a condition is a Boolean, never a
 number; a long expression that is used several times is assigned to a variable.
 Does not: use the meaning of a variable.
@@ -98,7 +98,7 @@ def unit_of_modelica(unit: str) -> str:
     return re.sub(r"\^(-?[0-9]+)", r"\1", unit).replace("*", ".")
 
 
-def written(
+def result_texts(
     function: Any,
     names: Sequence[Sequence[Text | Callable[[], Text]]],
     keep: Callable[[Text], Text],

@@ -34,8 +34,8 @@ from apc.exports.expressions import (
     Text,
     identifier,
     number,
+    result_texts,
     unit_of_modelica,
-    written,
 )
 from apc.exports.identifiers import identifier as word
 from apc.exports.peer_step import instant_functions, received_by
@@ -128,7 +128,7 @@ class _ModelicaWriter:
             peer.declare()
         for peer in peers:
             self.comment(f"{peer.name}: states")
-            rates = written(peer.peer_type.derivative, [peer.x, peer.u, peer.p, [TIME]], peer.keep)
+            rates = result_texts(peer.peer_type.derivative, [peer.x, peer.u, peer.p, [TIME]], peer.keep)
             for state, rate in zip(peer.x, rates, strict=True):
                 self.define(f"der({state.text})", rate.text)
         for peer in peers:
@@ -409,7 +409,7 @@ class _Peer:
         for sending in self.peer_type.sends:
             self.writer.comment(f"{self.name}: values sent over {sending.link}")
             x, u, t = self._sampled(self.writer.clock_of[sending.link])
-            values = written(sending.send, [x, u, self.p, t], self.keep)
+            values = result_texts(sending.send, [x, u, self.p, t], self.keep)
             starts = [number(float(item)) for item in begin[sending.link]]
             names = [f"{self.name}.{channel} sent" for channel in sending.channels]
             texts = [value.text for value in values]
@@ -431,7 +431,7 @@ class _Peer:
             for row in partition.memories
         ]
         r = [self._received(receive, partition.clock, [x, u, m], t) for receive in partition.receives]
-        values = written(partition.tick, [x, u, m, r, self.p, t], self.keep)
+        values = result_texts(partition.tick, [x, u, m, r, self.p, t], self.keep)
         for variable, value in zip(y, values, strict=True):
             writer.define(variable.text, value.text)
         for acting, hold in zip(self.u, self.peer_type.holds, strict=True):
@@ -458,7 +458,7 @@ class _Peer:
                 terms.append(received[receive.channel]())
                 unit = terms[-1].unit
             else:
-                terms.append(written(receive.edge, [*inside, received, self.p, t], self.keep)[0])
+                terms.append(result_texts(receive.edge, [*inside, received, self.p, t], self.keep)[0])
             weights.append(weight)
         total = sum(weights, Fraction(0))
         if receive.operator in ("mean", "max", "min"):

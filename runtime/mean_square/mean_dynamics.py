@@ -255,6 +255,10 @@ def mean_loop(
 ) -> MeanLoop:
     """Return the closed loop of mean dynamics, with the effect of the noise of some channels.
 
+    Its state is z of each subsystem with the mean of its receivers' memories, then the stored values and the
+    noise of each of `received_channels`: the columns of `matrix` beyond the coordinates are those of noise.
+    Neutral motions are removed.
+
     Parameters
     ----------
     loop

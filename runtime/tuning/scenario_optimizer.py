@@ -314,8 +314,21 @@ class ScenarioOptimizer:
         return rows_of
 
     def _optimum(self, shares: Floats, rows: ConstraintValues) -> Optimum:
-        """Return the optimum record at shares, with the multipliers that best balance the objective's
-        gradient.
+        """Return the record of a point, with Lagrange multipliers and an error bound of the objective.
+
+        Parameters
+        ----------
+        shares
+            The gains as shares (m,) of their ranges, 0 to 1.
+        rows
+            The constraints there, values ≤ 0 and slopes over the shares.
+
+        Notes
+        -----
+        At an optimum Σ_k μ_k ∇c_k = ∇f with μ ≥ 0 over the active constraints, and over the gains that are
+        not at an end of their range: μ by non-negative least squares. The error is the slack μ_k |c_k|, and
+        infinite if the gradients do not balance. Without a gain as objective the largest constraint is
+        minimized: its level is a further variable, with slope 1 in every constraint.
         """
         worst = float(rows.values.max(initial=-np.inf))
         is_interior = (shares > self._ends[0] + OPEN) & (shares < self._ends[1] - OPEN)

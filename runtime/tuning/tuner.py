@@ -320,8 +320,12 @@ class _Tuner:
         return ScenarioOptimizer(self.constraints, self.scenarios, None).shares(optimum)
 
     def _optimize_scenarios(self, column: int | None, starts: list[Floats]) -> Optimum:
-        """Return the optimum over all scenarios, with scenarios of larger constraints added until none
-        exists.
+        """Return the optimum over all scenarios, by an active set of scenarios.
+
+        The gains are optimized over a few scenarios. Then all others are evaluated at these gains: those with
+        a larger constraint join the set, and in the first turns inactive ones leave it. The search ends when
+        no scenario has a larger constraint and no other start gives better gains. When the time limit is
+        reached, the first start is returned if later gains violate a scenario.
 
         Parameters
         ----------

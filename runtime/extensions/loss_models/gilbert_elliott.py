@@ -236,8 +236,19 @@ def _sparse(terms: Sequence[tuple[float, int, int]], rows: int, columns: int) ->
 
 
 def _entry_orbits(lossy_frame: LossyFrame, sets: Sequence[Arcs]) -> Integers:
-    """Return the numbers of the entries of each set's matrix, one number for each orbit of the set's
-    stabilizer.
+    """Return the index (sets, n, n) of each entry of the covariances, equal for entries that are equal.
+
+    Each set of lost arcs has a covariance (n, n) of the states of all peers. Exchanges of peers that leave
+    the set unchanged leave its covariance unchanged: they permute its entries, and entries that they map to
+    each other (an orbit) are equal. The covariance is symmetric as well. An orbit has one index over all
+    sets.
+
+    Parameters
+    ----------
+    lossy_frame
+        The model over one frame.
+    sets
+        The sets of lost arcs.
     """
     sparse, graph = load_pool("scipy.sparse"), load_pool("scipy.sparse.csgraph")
     n, first = len(lossy_frame.mean), 0
