@@ -30,6 +30,7 @@ PARTS = {
     "process": ("Whole processes", "tests.bench.process"),
     "bench": ("Speed against error on the paper's topology", f"apc bench {AVERAGE}"),
     "hard": ("Hard cases", "apc bench --hard tests/hard"),
+    "growth": ("Cost against size", "tests.bench.growth --out tests/bench/growth.svg"),
     "scale": ("More peers", f"apc bench {AVERAGE} --scale 3,30,300,3000,30000,1e6"),
     "random_topologies": ("Random topologies", "tests.bench.random_topologies"),
     "random_scans": ("Random scans", "tests.bench.random_scans"),
@@ -56,7 +57,9 @@ def run(title: str, words: str) -> tuple[str, list[str], int]:
     text = "\n\n".join(printed for printed in (told.rstrip(), ran.stderr.rstrip()) if printed)
     end = f"\n\nIt ended with code {ran.returncode}." if ran.returncode else ""
     how = f"{datetime.now(tz=UTC).date()}, {used:.0f} s, load {load:.0f}"
-    return f"## {title}\n\n`{shown}` ({how})\n\n```text\n{text}\n```{end}\n", rows, ran.returncode
+    picture = words.partition("--out tests/bench/")[2].partition(" ")[0]
+    drawn = f"\n![{title}]({picture})\n" if picture else ""
+    return f"## {title}\n\n`{shown}` ({how})\n\n```text\n{text}\n```{end}\n{drawn}", rows, ran.returncode
 
 
 def main() -> None:
