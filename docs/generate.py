@@ -7,6 +7,7 @@ Does not: execute notebooks; their outputs are stored with them.
 
 from __future__ import annotations
 
+import ast
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -28,6 +29,11 @@ ROOT = Path(__file__).parent.parent
 TUTORIALS = ROOT / "models" / "notebooks"
 PUBLISHED = ROOT / "models" / "published" / "results.yaml"
 MESSAGES = ROOT / "tests" / "language" / "messages.txt"
+# The subpackages whose constants can decide an answer: core and studies, in the order of the layers.
+DECIDING = (
+    *("parameter_values", "linearization", "timing", "lifting", "network", "spectrum", "analysis"),
+    *("mean_square", "haptics", "simulation", "studies", "regions", "tuning", "extensions"),
+)
 FOLDERS = {
     "contacts": "Contacts",
     "coordination": "Coordination",
@@ -46,6 +52,7 @@ def write_pages(docs: Path) -> None:
     _write(docs / "reference" / "topologies.md", "\n".join(_gallery(docs / "_static" / "topologies")))
     _write(docs / "reference" / "published-results.md", "\n".join(_published()) + "\n")
     _write(docs / "reference" / "messages.md", "\n".join(_messages()))
+    _write(docs / "developer" / "thresholds.md", "\n".join(_thresholds()) + "\n")
     for notebook in sorted(TUTORIALS.glob("*.ipynb")):
         _write(docs / "tutorial" / notebook.name, notebook.read_text(encoding="utf-8"))
 
@@ -230,3 +237,60 @@ def _examples() -> dict[str, str]:
         if found := re.search(r"^(?:\d+:\d+|\S*?): ([EW]\d{3}) ", block, re.MULTILINE):
             examples.setdefault(found[1], block.strip("\n"))
     return examples
+
+
+# ---- thresholds ----
+
+
+def _thresholds() -> Iterator[str]:
+    """Yield the page of the numeric constants of each subpackage, with their reasons."""
+    yield from ("# Thresholds", "")
+    yield "The numeric constants of core, studies and extensions, each with its reason, from the sources."
+    yield "The largest numbers of states are those of `support.state_limits`."
+    for package in DECIDING:
+        rows = [
+            f"| `{names}` | {value} | `{path.stem}` | {reason} |"
+            for path in sorted((ROOT / "runtime" / package).rglob("*.py"))
+            for names, value, reason in constants(path)
+        ]
+        yield from ("", f"## {package}", "", "| name | value | module | reason |", "|---|---|---|---|", *rows)
+
+
+def constants(path: Path) -> Iterator[tuple[str, str, str]]:
+    """Yield the names, the values and the reason of each numeric constant of a module.
+
+    The reason is the comment on its line, or the one above it or above the constants it follows.
+    """
+    source = path.read_text(encoding="utf-8")
+    lines, above, end = source.splitlines(), "", 0
+    for node in ast.parse(source).body:
+        first = node.lineno - 2
+        if not (isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name | ast.Tuple)):
+            continue
+        names = ast.unparse(node.targets[0]).strip("()")
+        value = lines[node.lineno - 1].partition("=")[2].partition("#")[0].strip()
+        if not (names.replace("_", "").replace(", ", "").isupper() and _is_numeric(node.value)):
+            continue
+        block = []
+        while first >= 0 and lines[first].startswith("# "):
+            block.insert(0, lines[first][2:])
+            first -= 1
+        if block or end != node.lineno - 1:  # a comment of its own, or the first constant of a block
+            above = " ".join(block)
+        end = node.end_lineno or node.lineno
+        beside = " ".join(
+            line.partition("  # ")[2] for line in lines[node.lineno - 1 : end] if "  # " in line
+        )
+        shown = ast.unparse(node.value) if node.end_lineno != node.lineno else value
+        yield names, shown.strip("()"), (beside or above).replace("|", "\\|")
+
+
+def _is_numeric(node: ast.expr) -> bool:
+    """Return whether an expression consists of numbers."""
+    operations = ast.Tuple | ast.BinOp | ast.UnaryOp | ast.operator | ast.unaryop | ast.expr_context
+    return all(
+        isinstance(part.value, int | float) and not isinstance(part.value, bool)
+        if isinstance(part, ast.Constant)
+        else isinstance(part, operations)
+        for part in ast.walk(node)
+    )

@@ -44,7 +44,6 @@ AHEAD, MOST_AHEAD = 64, 2**19
 # netem's Pareto table (iproute2, netem/pareto.c): shape 3, its mean 3/2 taken off, times 4/3, and no more
 # than 4, the largest number that the table can hold (32767/8192).
 PARETO_SHAPE = 3
-
 PARETO_MOST = 4.0
 
 # The largest numbers of `deviates`: from 53 random bits, a normal number is never beyond √(2·53·ln 2) = 8.57.

@@ -30,7 +30,7 @@ from apc.result import Result
 
 Floats = NDArray[np.float64]
 
-CONFIDENCE = 0.95
+CONFIDENCE = 0.95  # of the intervals of a recording
 # Losses are reported as dependent if independent losses would show the same dependence in less than one
 # recording in a thousand.
 CHANCE = 1e-3

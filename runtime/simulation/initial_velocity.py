@@ -21,7 +21,7 @@ from apc.simulation.signals import sent_states
 # The default initial velocity of the device in m/s, and the default duration in s.
 SPEED, WATCHED = 0.1, Fraction(1)
 
-MM = 1e3
+MM = 1e3  # millimetres per metre
 
 _PEER = re.compile(r"(?P<group>.+?)(\[(?P<number>\d+)\])?")
 

@@ -46,7 +46,7 @@ from apc.support.processes import (
 )
 from apc.support.threads import single_threaded
 
-QUANTILES = (0.05, 0.5, 0.95)
+QUANTILES = (0.05, 0.5, 0.95)  # of the motions of all runs that are reported
 SURE = 1.959963984540054  # standard deviations of the two-sided 95 % interval of a normal distribution
 # Verdicts of runs that decay, and of those that don't.
 CALM, SUSTAINED = (

@@ -60,7 +60,7 @@ RESPONSES = {
     "coordination_error": ("coordination_error", "error_bound"),
 }
 PART_OF = {"damping": "low_frequency", "coordination_error_h2": "h2", HINF: "hinf"}
-TINY = 1e-300
+TINY = 1e-300  # the least magnitude of which a logarithm is taken
 
 # The lowest frequency in Hz of the search for the largest gain; the increase over the gain at known
 # frequencies above which a frequency is added.
