@@ -1,7 +1,7 @@
 """Communication graphs and delays between groups, from a link's entry.
 
 Takes: the YAML nodes of `graph` and `delays`. Gives: `read_graph`, the `Graph` of a compiled model;
-`read_delays`, a `DelayDeclaration` per entry.
+`read_delays`, a `DelayDeclaration` per entry; `may_have_self_arcs`.
 Guarantees: every peer of an edge exists; weights are finite and not zero.
 Does not: build a matrix: a complete graph, a ring and a star are stored by name.
 """
@@ -22,6 +22,7 @@ from apc.compiler.language.csv_tables import open_table
 from apc.compiler.language.dimensions import SECOND
 from apc.compiler.language.values import AlreadyReportedError, ScalarValue
 from apc.compiler.number_parsing import plain_float
+from apc.compiler.source import nodes
 from apc.compiler.source.nodes import Node, Scalar, Sequence
 from apc.compiler.source.reading import MappingReader, among, brief, fault, form, mapping_of, text_of, unknown
 from apc.compiler.topology.topology_parameters import NamedNumbers
@@ -147,6 +148,18 @@ def _example(numbered: Mapping[str, int]) -> str:
     return next((name for name in numbered if name.endswith("]")), "user[1]")
 
 
+def may_have_self_arcs(node: Node | None) -> bool:
+    """Return whether the YAML node of a graph lists an arc from a peer to itself, or names a file."""
+    arcs = node.get("arcs") if isinstance(node, nodes.Mapping) else None
+    if not isinstance(arcs, Sequence):
+        return arcs is not None
+    pairs = (pair.items[:2] for pair in arcs.items if isinstance(pair, Sequence) and len(pair.items) >= 2)
+    return any(
+        isinstance(first, Scalar) and isinstance(second, Scalar) and first.text == second.text
+        for first, second in pairs
+    )
+
+
 def _peer_indices(counts: Mapping[str, int]) -> dict[str, int]:
     """Return the zero-based index of each peer by its two spellings: its number from 1, and its name, such
     as `left[2]`.
@@ -194,8 +207,9 @@ def _arc(pair: Node, subject: str, index_of: Mapping[str, int], mistakes: Mistak
         weight = float(number)
     if len(ends) < 2:
         raise AlreadyReportedError
-    if ends[0] == ends[1]:
-        raise fault("E213", pair.location, f"peer {ends[0] + 1} can't be connected to itself")
+    if ends[0] == ends[1] and subject == "edges":
+        message = f"an edge can't connect peer {ends[0] + 1} to itself"
+        raise fault("E213", pair.location, message, advice="use arcs for a peer that sends to itself")
     return ends[0], ends[1], weight
 
 

@@ -32,6 +32,7 @@ from apc.compiler.language.values import PEERS, ScalarValue, ValueBinding, renam
 from apc.compiler.language.vectors import entries, whole_and_index
 from apc.compiler.source.nodes import Node, Scalar, Sequence
 from apc.compiler.source.reading import among, fault, form, text_of
+from apc.compiler.topology.graphs import may_have_self_arcs
 from apc.compiler.topology.topology_parameters import NamedNumbers
 
 LINK_ROLES = ("graph", "delays", "loss", "trace")
@@ -132,7 +133,7 @@ class PartReader:
             return
         peers, peer_limit = sum(counts[group] for group in groups), component.peers
         subject = f"{name} ({component.name})"
-        if component.receives_from_others and peers == 1:
+        if component.receives_from_others and peers == 1 and not self._has_self_arcs():
             message = f"{name} receives from other peers"
             fix = f"at: [{', '.join(counts)}]" if len(counts) > 1 else f"{next(iter(counts))}: {{count: 2}}"
             mistakes.add("E208", entry.location, message, expected="at least 2 peers", got="1", fix=fix)
@@ -192,6 +193,11 @@ class PartReader:
                     reader = partial(read_time_table, name=name, unit=unit, named_at=node.location)
                     time_tables.append(self.numbers.files.read(text_of(node, name, fix), reader))
         return tuple(filter(None, time_tables))
+
+    def _has_self_arcs(self) -> bool:
+        """Return whether a link of the topology may connect a peer to itself."""
+        links = (entry for entry in self.scope.parts.entries.values() if entry.section == "links")
+        return any(may_have_self_arcs(entry.body.get("graph")) for entry in links)
 
     def _groups_of(self, entry: PartEntry) -> tuple[str, ...]:
         """Return the groups of peers that have a part: the list `at` of its entry, or all groups."""

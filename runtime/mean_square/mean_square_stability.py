@@ -267,6 +267,8 @@ def _other_coupling(system: Model, link: Link) -> str:
         for receive in partition.receives
         if receive.link == link.name
     ]
+    if link.graph.shape == "arcs" and (link.graph.arcs[:, 0] == link.graph.arcs[:, 1]).any():
+        return f"packets of {link.name} that a peer sends to itself"
     if any(receive.age for receive in receives):
         return f"the random age of packets of {link.name}, which enters the equations"
     if any(receive.before for receive in receives):

@@ -172,7 +172,7 @@ class PeerLoop:
         wrong = (
             (
                 not needed,
-                f"{self.name} neither sends nor receives over a link",
+                f"{self.name} exchanges no packets with another peer",
                 "apc simulate",
                 "",
             ),
