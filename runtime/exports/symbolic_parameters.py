@@ -31,7 +31,8 @@ from apc.exports.identifiers import ExportedSignal, words
 from apc.exports.lifted import FrameNumbers, StateSpace, lifted, peers_of, state_space, steps_in_floats
 from apc.lifting.devices import ForceInput
 from apc.lifting.interval_arithmetic import Arithmetic
-from apc.lifting.numeric_model import PeerIndices, numeric_model
+from apc.lifting.model_numbers import PeerIndices
+from apc.lifting.numeric_model import numeric_model
 from apc.linearization.linear_subsystem import LinearSubsystem
 from apc.linearization.linearize import subsystem_of_entries
 from apc.network.nominal_criterion import refuse_channel_number

@@ -1,6 +1,6 @@
 """The values that peers receive at the start, and the gains of their edge functions.
 
-Takes: a `NumericModel`, and its peers in classes with equal start.
+Takes: the numbers of a model, and its peers in classes with equal start.
 Gives: `StartClasses`, `Gains`.
 Guarantees: exact rationals.
 Does not: choose the classes, or linearize (see `peer_classes`).
@@ -14,7 +14,7 @@ from typing import Any
 
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.weights import exact_weight
-from apc.lifting.numeric_model import NumericModel, PeerIndices
+from apc.lifting.model_numbers import ModelNumbers, PeerIndices
 from apc.linearization.jacobians import edge_name
 from apc.linearization.linearize import InitialReception, start_sends, start_values
 from apc.parameter_values.exact_arithmetic import evaluate_exact
@@ -32,7 +32,7 @@ class StartClasses:
     clock partition.
     """
 
-    def __init__(self, numeric: NumericModel, classes: Sequence[PeerIndices]) -> None:
+    def __init__(self, numeric: ModelNumbers, classes: Sequence[PeerIndices]) -> None:
         self.exchange = exchange = numeric.exchange
         self.counts = list(map(len, classes))
         self.peers = [peers.first for peers in classes]

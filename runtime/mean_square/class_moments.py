@@ -24,7 +24,8 @@ from apc.analysis.analysis import lifted_groups
 from apc.compiler.compiled import Clock, Model, PeerType
 from apc.lifting.interval_arithmetic import error_radius, value_of
 from apc.lifting.lift import FrameMap
-from apc.lifting.numeric_model import NumericModel, PeerIndices
+from apc.lifting.model_numbers import PeerIndices
+from apc.lifting.numeric_model import NumericModel
 from apc.lifting.taylor_models import arithmetic_of
 from apc.mean_square.mean_dynamics import (
     ReceivedChannel,

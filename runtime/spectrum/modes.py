@@ -29,7 +29,7 @@ from dataclasses import dataclass, replace
 from fractions import Fraction
 
 from apc.compiler.weights import exact_weight
-from apc.lifting.numeric_model import PeerIndices
+from apc.lifting.model_numbers import PeerIndices
 from apc.spectrum.graph_loops import common_graph, graph_loop, graph_scale
 from apc.spectrum.graph_modes import graph_modes
 from apc.spectrum.interconnection import ClosedLoop, Coupling, ModalSystem, close_loop

@@ -25,7 +25,8 @@ from numpy.typing import NDArray
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.lifting.initial_reception import Gains, StartClasses
 from apc.lifting.lift import FrameMap, check_packets, lift
-from apc.lifting.numeric_model import NumericModel, PeerIndices
+from apc.lifting.model_numbers import PeerIndices
+from apc.lifting.numeric_model import NumericModel
 from apc.linearization.evaluation_errors import at_part
 from apc.linearization.jacobians import SubsystemJacobians
 from apc.linearization.linear_subsystem import LinearSubsystem, rational_floats

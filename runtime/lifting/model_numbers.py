@@ -1,0 +1,113 @@
+"""The numbers of a model at its parameter values, resolved for each peer.
+
+Takes: a `Model` and the Jacobians of its peer types.
+Gives: `ModelNumbers`, `PeerIndices`.
+Guarantees: data that does not depend on parameter values is built once.
+Does not: change parameter values (see `numeric_model`).
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from fractions import Fraction
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.compiler.compiled import Model
+from apc.linearization.jacobians import SubsystemJacobians
+from apc.parameter_values.parameters import ResolvedNumbers, resolve
+from apc.timing.communication_graph import CommunicationGraph, build_exchange
+from apc.timing.schedule import ORDER, Schedule
+from apc.timing.scheduling import build_schedules
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class PeerIndices:
+    """The peer numbers of a model, as consecutive runs, one per group: a billion peers take no memory."""
+
+    runs: tuple[range, ...]
+
+    def __len__(self) -> int:
+        return sum(map(len, self.runs))
+
+    def __iter__(self) -> Iterator[int]:
+        return itertools.chain.from_iterable(self.runs)
+
+    def __contains__(self, peer: object) -> bool:
+        return any(peer in run for run in self.runs)
+
+    @property
+    def first(self) -> int:
+        """The first peer."""
+        return self.runs[0].start
+
+    @property
+    def last(self) -> int:
+        """The last peer."""
+        return self.runs[-1][-1]
+
+    @property
+    def others(self) -> PeerIndices:
+        """All peers but the first."""
+        return PeerIndices(tuple(run for run in (self.runs[0][1:], *self.runs[1:]) if run))
+
+
+@dataclass(frozen=True)
+class ModelNumbers:
+    """A model at its parameter values, with the Jacobians of each peer type: the data of a `NumericModel`.
+
+    `order` is the order of coincident events. If `starting`, the Jacobians are those at each peer type's
+    start, as functions of its parameters. `given_schedules`, one per group, replace those of
+    `build_schedules`. Equal models with the same Jacobians and order are equal.
+    """
+
+    model: Model
+    jacobians: tuple[SubsystemJacobians, ...]
+    order: tuple[str, ...] = ORDER
+    starting: bool = field(default=False, compare=False)
+    given_schedules: tuple[Schedule, ...] = field(default=(), compare=False, repr=False)
+
+    @property
+    def timings(self) -> dict[str, Fraction]:
+        """Seconds by the name of the timing."""
+        return {timing.name: timing.value for timing in self.model.timings}
+
+    @cached_property
+    def schedules(self) -> tuple[Schedule, ...]:
+        """The schedule of each group."""
+        if self.given_schedules:
+            return self.given_schedules
+        patterns = [subsystem.pattern for subsystem in self.jacobians]
+        return build_schedules(self.model, self.timings, patterns, order=self.order)
+
+    @cached_property
+    def numbers(self) -> ResolvedNumbers:
+        """The resolved parameters of all peers."""
+        return resolve(self.model)
+
+    @cached_property
+    def exchange(self) -> CommunicationGraph:
+        """The communication graph."""
+        return build_exchange(self.model, self.timings)
+
+    @property
+    def subsystems(self) -> tuple[SubsystemJacobians, ...]:
+        """The Jacobians of each group's peer type."""
+        return tuple(self.jacobians[group.peer_type] for group in self.model.groups)
+
+    @property
+    def affine(self) -> bool:
+        """Whether the equations of every group are affine."""
+        return all(subsystem.affine for subsystem in self.subsystems)
+
+    def vector(self, peer: int) -> Floats:
+        """Return the parameters (n_p,) of a peer."""
+        group = self.exchange.group_of(peer)
+        row = self.numbers.rows[group][peer - self.exchange.starts[group]]
+        return np.asarray(self.numbers.parameters[group][row])
