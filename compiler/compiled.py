@@ -4,7 +4,7 @@ Takes: nothing (data types, created by the stage `functions` and read by the run
 Gives: `Model` and its parts: `Clock`, `Graph`, `PairDelay`, `Loss`, `Channel`, `Link`; `Formula`, `Timing`,
 `Parameter`; `State`, `Hold`, `Receive`, `ClockPartition`, `SendPartition`, `ForcePorts`, `Limit`, `Replaced`,
 `PeerType`; `PeerColumn`, `Group`; `Experiment`, `Axis`. The names of counted parameters: `PEERS`, `count_of`,
-`group_count`, `counts_peers`. `LENGTH`, `ANGLES`.
+`group_count`, `counts_peers`. Those of an equilibrium: `rest_of`, `start_of`. `LENGTH`, `ANGLES`.
 Guarantees: plain frozen data; numbers in SI; periods, phases and delays exact rationals of a second.
 Does not: evaluate anything, or read or write files (see `store`).
 
@@ -35,12 +35,23 @@ PEERS = "peers"  # the parameter for the number of all peers
 LARGEST_COUNT = 10**9  # of peers in one group
 MOST_GROUPS = 1000  # groups of a model: the communication between groups has an entry per pair
 MOST_PLACED = 10**6  # peers of a model on a graph that isn't complete: several arrays have an entry per peer
+REST = "rest("  # prefix of the parameters that replace start values by those of an equilibrium, see `rest_of`
 COUNT = "count("  # prefix of the parameters that count received peers of a link, see `count_of`
 
 
 def count_of(link: str) -> str:
     """Return the name of the parameter for the weighted number of peers received over a link."""
     return f"{COUNT}{link})"
+
+
+def rest_of(start: str) -> str:
+    """Return the name of the parameter that replaces a start value; no part can have this name."""
+    return start if start.startswith(REST) else f"{REST}{start})"
+
+
+def start_of(name: str) -> str:
+    """Return the name of the start value that a parameter of `rest_of` replaces; another name unchanged."""
+    return name.removeprefix(REST).removesuffix(")") if name.startswith(REST) else name
 
 
 def group_count(group: str) -> str:
@@ -203,13 +214,15 @@ class State:
 class Hold:
     """A zero-order hold, a row of u: output `output` of clock partition `clock`.
 
-    A value acts from its tick + the timing `delay` on. Before the first value acts, the hold is zero.
+    A value acts from its tick + the timing `delay` on. Before the first value acts, the hold is zero, or the
+    parameter `start` of a model whose start values are those of an equilibrium.
     """
 
     name: str
     clock: str
     output: int
     delay: str
+    start: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -389,6 +402,7 @@ class Model:
     dependence. `warnings` are texts on unusual parts of the topology, with locations. `region` are the axes x
     and y of the study `region`, with none or one if unspecified. `within` are the delays given as a range,
     whose value is the middle of the range. `tune` are the entries of the study `tune`, as option texts.
+    `at_equilibrium` states that the model is linearized at its equilibrium instead of its start values.
     """
 
     name: str
@@ -407,6 +421,7 @@ class Model:
     followers: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
     within: tuple[Axis, ...] = ()
+    at_equilibrium: bool = False
 
     def __repr__(self) -> str:
         """Return a one-line representation."""

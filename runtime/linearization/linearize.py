@@ -51,14 +51,18 @@ class InitialReception:
 def start_values(
     subsystem: SubsystemJacobians, parameters: Sequence[Any]
 ) -> tuple[list[Any], list[Any], list[list[Any]]]:
-    """Return x, u and the memories of every clock partition at the start, with zero outputs of holds."""
+    """Return x, u and the memories of every clock partition at the start.
+
+    Outputs of holds are zero, unless the start is an equilibrium.
+    """
     position = {name: index for index, name in enumerate(subsystem.peer_type.parameters)}
     x = [parameters[position[state.start]] for state in subsystem.peer_type.states]
     m = [
         [parameters[position[start]] for start in partition.starts]
         for partition in subsystem.peer_type.clocks
     ]
-    return x, [0] * len(subsystem.peer_type.holds), m
+    u = [parameters[position[hold.start]] if hold.start else 0 for hold in subsystem.peer_type.holds]
+    return x, u, m
 
 
 def start_sends(
@@ -82,14 +86,15 @@ def start_sends(
 
 
 def start_names(system: Model) -> set[str]:
-    """Return the parameters that are start values of states and of clock memories."""
+    """Return the parameters that are start values of states, of clock memories and of holds."""
     return {name for peer_type in system.peer_types for name in _start_names(peer_type)}
 
 
 def _start_names(peer_type: PeerType) -> list[str]:
-    """Return the parameters of a peer type that are start values of states and clock memories."""
+    """Return the parameters of a peer type that are start values of states, clock memories and holds."""
     memory_starts = (name for clock in peer_type.clocks for name in clock.starts)
-    return [*(state.start for state in peer_type.states), *memory_starts]
+    hold_starts = (hold.start for hold in peer_type.holds if hold.start)
+    return [*(state.start for state in peer_type.states), *memory_starts, *hold_starts]
 
 
 def reaches_start(system: Model, parameter_ref: ParameterRef) -> bool:
@@ -117,7 +122,10 @@ def sends_nothing(peer_type: PeerType, rows: NDArray[np.float64]) -> bool:
         start_by_index = dict(zip(starts, values, strict=True))
         vector = [start_by_index.get(index, symbol) for index, symbol in enumerate(symbols)]
         x = casadi.vertcat(*(vector[position[state.start]] for state in peer_type.states))
-        arguments = [x, casadi.SX.zeros(len(peer_type.holds)), casadi.vertcat(*vector), casadi.SX(0)]
+        u = casadi.vertcat(
+            *(vector[position[hold.start]] if hold.start else casadi.SX(0) for hold in peer_type.holds)
+        )
+        arguments = [x, u, casadi.vertcat(*vector), casadi.SX(0)]
         if not all(send.send(*arguments).is_zero() for send in peer_type.sends):
             return False
     return True

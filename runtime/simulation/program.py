@@ -3,8 +3,8 @@
 Takes: parameter vectors, the transitions over each interval, start values; the subsystem of each peer of a
 group.
 Gives: `Program`, `Segment`, `Layout`; `GroupProgram`, `build_member`; `timed_events`, `seconds_at`.
-Guarantees: the carry at time 0 has start states, and zeros for values not yet computed. Data common to
-several peers is stored once.
+Guarantees: the carry at time 0 has start states, and zeros for values not yet computed, or those of an
+equilibrium. Data common to several peers is stored once.
 Does not: build the functions (see `program_builder`), or handle other members (see `exchange_program`,
 `population`).
 
@@ -188,7 +188,7 @@ def build_member(
     """
     used, subsystem_of_peer = np.unique(rows, return_inverse=True)
     used_vectors, peer_type, layout = vectors[used], subsystem.peer_type, program.layout
-    x, _, memories = start_values(subsystem, list(used_vectors.T))
+    x, u, memories = start_values(subsystem, list(used_vectors.T))
     carry = np.zeros((len(used_vectors), layout.ends[-1]))
     for row, value in enumerate(x):
         carry[:, row] = value
@@ -196,7 +196,14 @@ def build_member(
         for output, value in zip(partition.memories, values, strict=True):
             if (p, output) in layout.outputs:  # otherwise its clock never ticks
                 carry[:, layout.states + layout.outputs.index((p, output))] = value
-    states, zero_holds = carry[:, : layout.states].T, np.zeros((layout.holds, len(used_vectors)))
+    for row, (hold, value) in enumerate(zip(peer_type.holds, u, strict=True), layout.held.start):
+        carry[:, row] = value
+        # Values of earlier ticks that act later: those of the hold at an equilibrium, zero otherwise.
+        for later, source in enumerate(layout.later_values, layout.held.stop):
+            clock = peer_type.clocks[source.partition].clock
+            if hold.start and (clock, source.output) == (hold.clock, hold.output):
+                carry[:, later] = value
+    states, holds = carry[:, : layout.states].T, carry[:, layout.held].T
     return GroupProgram(
         group=group,
         peers=peers,
@@ -206,7 +213,7 @@ def build_member(
         constants=program.constants(used_vectors, [transition[used] for transition in transitions]),
         sends={
             send.link: np.asarray(
-                send.send.map(len(used_vectors))(states, zero_holds, used_vectors.T, 0.0), np.float64
+                send.send.map(len(used_vectors))(states, holds, used_vectors.T, 0.0), np.float64
             ).T
             for send in peer_type.sends
         },
