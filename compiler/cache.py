@@ -44,6 +44,7 @@ LARGEST_ORIGIN = 64 * 2**20  # bytes of the third line, which require up to ten 
 SUFFIX = ".yaml"  # of the files in a folder of components
 WITHOUT_COMPONENTS = {"published", "topologies"}  # folders of models/ outside the component library
 HANDS_CHANGE = "hands"  # replaces the parameter name if hands were attached to devices
+EQUILIBRIUM_CHANGE = "equilibrium"  # replaces the parameter name if start values are those of an equilibrium
 _RATIONAL = re.compile(r"-?[0-9]{1,4000}(/[1-9][0-9]{,4000})?")
 FOREIGN = "is damaged, or was not written by apc compile"
 
@@ -54,7 +55,8 @@ class Origin:
 
     `texts` are the topology, whose name is `topology`, and all referenced texts, as bytes by name; `program`
     is the digest of the compiler. `changes` were made to the compiled model in sequence: names of numbers
-    with values in SI units, or `HANDS_CHANGE` with the attached hands (see `lifting.devices`).
+    with values in SI units, `HANDS_CHANGE` with the attached hands (see `lifting.devices`), or
+    `EQUILIBRIUM_CHANGE` with the start of the search (see `lifting.rest_position`).
     """
 
     topology: str
@@ -133,7 +135,10 @@ def read_archive(path: Path) -> Archive:
         if name in ("", "..") or PurePath(name).name != name or name not in dict(model_origin.texts):
             raise ValueError
         numbers = (pair for change in model_origin.changes for pair in change)
-        if not all(name == HANDS_CHANGE or _RATIONAL.fullmatch(value) for name, value in numbers):
+        if not all(
+            name in (HANDS_CHANGE, EQUILIBRIUM_CHANGE) or _RATIONAL.fullmatch(value)
+            for name, value in numbers
+        ):
             raise ValueError
     except (ValueError, RecursionError):  # nested too deeply
         raise fault("E604", location, FOREIGN, fix=fix, advice=advice) from None

@@ -54,6 +54,9 @@ from .api import (
     mean_square_stability as mean_square_stability,
 )
 from .api import (
+    operating_point as operating_point,
+)
+from .api import (
     paper_method as paper_method,
 )
 from .api import (
@@ -113,6 +116,7 @@ from .extensions.switching.arbitrary_switching import ArbitrarySwitching as Arbi
 from .extensions.switching.limit_cycle import LimitCycle as LimitCycle
 from .haptics.absolute_stability import AbsoluteStability as AbsoluteStability
 from .haptics.frequency_response import Transparency as Transparency
+from .lifting.rest_position import OperatingPoint as OperatingPoint
 from .mean_square.mean_square_stability import MeanSquareStability as MeanSquareStability
 from .network.link_fit import LinkFit as LinkFit
 from .parameter_values.parameter_listing import Parameters as Parameters

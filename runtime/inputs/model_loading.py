@@ -13,7 +13,7 @@ from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from apc.compiler.cache import HANDS_CHANGE, Archive, program_digest
+from apc.compiler.cache import EQUILIBRIUM_CHANGE, HANDS_CHANGE, Archive, program_digest
 
 if TYPE_CHECKING:
     from apc.compiler.compiled import Model
@@ -51,11 +51,14 @@ def loaded_model(archive: Archive, folder: Path) -> Model:
 def _reapplied(system: Model, change: Sequence[tuple[str, str]]) -> Model:
     """Return a model after a change recorded in the origin. Raises ApcError if the change is impossible."""
     from apc.lifting.devices import with_hands
+    from apc.lifting.rest_position import operating_point_from
     from apc.parameter_values.overrides import Override, apply
     from apc.parameter_values.parameter_names import find
 
     for name, value in change:
         if name == HANDS_CHANGE:
             return with_hands(system, value)
+        if name == EQUILIBRIUM_CHANGE:  # from the start values, wherever the search began
+            return operating_point_from(system).model
     pairs = [(find(system, name, counts=True), Fraction(value)) for name, value in change]
     return apply(system, [Override(free, value) for free, value in pairs])

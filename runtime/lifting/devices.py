@@ -776,12 +776,15 @@ def rewritten(
         Returns the new rates, from the original states and the new holds, parameters and time.
     """
     sizes = len(peer_type.states), len(peer_type.holds), len(peer_type.parameters)
-    x, u, p = (casadi.SX.sym(name, size) for name, size in zip("xup", sizes, strict=True))
+    functions = [peer_type.derivative, *(clock.tick for clock in peer_type.clocks)]
+    plain = all(function.is_a("SXFunction") for function in functions)  # else with a nonlinear loop
+    symbol: Any = casadi.SX.sym if plain else casadi.MX.sym
+    x, u, p = (symbol(name, size) for name, size in zip("xup", sizes, strict=True))
     states, hold_count, parameter_count = original_states(x, p), len(original.holds), len(original.parameters)
 
     def repeated(function: Any, body: Callable[..., Any] | None = None) -> Any:
         """Return a function (x, u, …, p, t) over the new states, holds and parameters."""
-        _, _, *between, _, t = function.sx_in()
+        _, _, *between, _, t = function.sx_in() if plain else function.mx_in()
         value = (
             body(states, u, p, t)
             if body

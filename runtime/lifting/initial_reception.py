@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from fractions import Fraction
 from typing import Any
 
+from apc.compiler.compiled import Receive
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.weights import exact_weight
 from apc.lifting.model_numbers import ModelNumbers, PeerIndices
@@ -74,6 +75,13 @@ class StartClasses:
     def senders(self, link: str, g: int) -> int:
         """Return the number of peers from which a peer of class g receives over a link."""
         return sum(number for _, _, number in self._senders(link, g))
+
+    def factors(self, receive: Receive, g: int) -> list[tuple[int, float]]:
+        """Return the factor of each sending class in a receive of class g; 1 for a maximum or minimum."""
+        senders = self._senders(receive.link, g)
+        norm = self._divisor(receive.operator, g, receive.link, senders)
+        linear = receive.operator in ("sum", "mean")
+        return [(h, float(weight / norm) if linear else 1.0) for h, weight, _ in senders]
 
     def sent_to(self, link: str, g: int) -> list[list[Fraction]]:
         """Return the start values that class g receives over a link, a list for each class of senders."""

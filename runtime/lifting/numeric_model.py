@@ -2,7 +2,8 @@
 
 Takes: a `Model`.
 Gives: `NumericModel`, `numeric_model`, `linearized_at_start`, `delay_search_refused`.
-Guarantees: data that does not depend on parameter values is built once.
+Guarantees: data that does not depend on parameter values is built once. A model that is linearized at its
+equilibrium has the equilibrium of its parameter values.
 Does not: group peers, or analyse (see `peer_classes`).
 """
 
@@ -15,6 +16,8 @@ from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.lifting.data_age import at_timings, linear_subsystems
 from apc.lifting.model_numbers import ModelNumbers
+from apc.lifting.rest_position import at_equilibrium
+from apc.lifting.start_parameters import has_start_parameters
 from apc.linearization.jacobians import SubsystemJacobians
 from apc.linearization.linearize import at_start, reaches_start, sends_nothing
 from apc.parameter_values.parameter_names import ParameterRef
@@ -28,7 +31,7 @@ class NumericModel(ModelNumbers):
         """Return the same topology with other parameter values.
 
         The Jacobians are shared, and the schedules if the timings are equal. The ages of received values
-        follow the timings.
+        follow the timings. A model at its equilibrium has that of the new values.
 
         Raises
         ------
@@ -37,6 +40,8 @@ class NumericModel(ModelNumbers):
         """
         if model is self.model:
             return self
+        if model.at_equilibrium and not (self.starting and has_start_parameters(model)):
+            model = at_equilibrium(model)
         changed = replace(self, model=model, given_schedules=())
         if changed.timings == self.timings:
             return replace(changed, given_schedules=self.schedules)
@@ -64,8 +69,10 @@ def numeric_model(model: Model) -> NumericModel:
     Raises
     ------
     ApcError
-        E811 as `data_age.nominal`.
+        E811 as `data_age.nominal`; for a model at its equilibrium, as `rest_position.operating_point_from`.
     """
+    if model.at_equilibrium:
+        model = at_equilibrium(model)
     return NumericModel(model, linear_subsystems(model))
 
 

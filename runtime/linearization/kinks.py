@@ -1,8 +1,8 @@
 """Kinks: points where an equation of a peer has different slopes on different sides.
 
 Takes: a peer type of a `Model`, a point at which it is linearized.
-Gives: `Point`, `LinearPiece`, `linear_pieces_at`, `one_sided_peer_type`, `names_of`; `tie_indicators`,
-`refuse_kinks`, `at_a_kink`; `equal`.
+Gives: `Point`, `LinearPiece`, `linear_pieces_at`, `one_sided_peer_type`, `names_of`; `active_branches`;
+`tie_indicators`, `refuse_kinks`, `at_a_kink`; `equal`.
 Guarantees: a piece is selected by some direction of motion away from the point, to first order: slopes that
 no side has are never returned. A one-sided peer type has the values of the original, and at the point the
 slopes of its piece.
@@ -15,6 +15,7 @@ motion: on either side one of the two acts.
 from __future__ import annotations
 
 import functools
+import itertools
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -165,6 +166,40 @@ def linear_pieces_at(
         if every or not any(equal(piece.slopes, other.slopes) for other in result):
             result.append(piece)
     return tuple(result)
+
+
+def active_branches(switched: SwitchedPeerType, point: Point) -> dict[str, bool]:
+    """Return whether each variable with a kink is on its steepest branch, such as that of a closed contact.
+
+    Variables whose branches all have slopes of one size, such as |x|, and those that depend on single senders
+    are left out.
+
+    Parameters
+    ----------
+    switched, point
+        As for `linear_pieces_at`.
+    """
+    functions = _guards(switched)
+    columns = [list(point.get(name, [0.0] * c.numel())) for name, c in switched.columns.items()]
+    symbols = _symbols(switched, functions, columns, {})
+    single = casadi.vertcat(*(c for name, c in switched.columns.items() if name.startswith("s")))
+    decisions_by_name: dict[str, list[int]] = {}
+    for index, decision in enumerate(switched.decisions):
+        if not decision.point and not (single.numel() and casadi.depends_on(decision.guard, single)):
+            for name in names_of(switched, [index]):
+                decisions_by_name.setdefault(name, []).append(index)
+    result = {}
+    for name, indices in decisions_by_name.items():
+        sizes = []
+        for settings in itertools.product((0.0, 1.0), repeat=min(len(indices), MOST_TIES)):
+            changed = [*symbols]
+            for index, setting in zip(indices, settings, strict=False):
+                changed[index] = setting
+            sizes.append(float(np.linalg.norm(np.asarray(functions.slopes(*columns, changed)[1]))))
+        size = float(np.linalg.norm(np.asarray(functions.slopes(*columns, symbols)[1])))
+        if max(sizes) > min(sizes) * (1 + EQUAL):
+            result[name] = size >= max(sizes) * (1 - EQUAL)
+    return result
 
 
 def _symbols(

@@ -18,6 +18,7 @@ from fractions import Fraction
 from apc.compiler.compiled import (
     COUNT,
     PEERS,
+    REST,
     Model,
     Parameter,
     Timing,
@@ -229,9 +230,10 @@ def is_named(name: str) -> bool:
     """Return whether a parameter or timing has a name in the topology.
 
     Counts of the compiler, such as `peers` and `count(lan)`, and the delay of a hold without one or by an
-    expression, cannot be set by the user: their names contain characters that no name of a topology has.
+    expression, cannot be set by the user: their names contain characters that no name of a topology has. The
+    same holds for the values of an equilibrium.
     """
-    return not counts_peers(name) and " " not in name
+    return not counts_peers(name) and not name.startswith(REST) and " " not in name
 
 
 def named_times(system: Model) -> list[Timing]:
