@@ -22,6 +22,7 @@ from apc.analysis.one_sided_slopes import Side
 from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.lifting.numeric_model import NumericModel, numeric_model
+from apc.lifting.rest_position import operating_point_from
 from apc.result import Result
 from apc.studies.margins import NOT_STABLE, Margins, network_margins
 from apc.studies.margins import margins as margins_of
@@ -101,7 +102,14 @@ def analysis_report(numeric: NumericModel, *, method: str = "auto", certify: boo
     certify
         Prove the verdict in ball arithmetic.
     """
-    return _run_method(numeric, method=method, certify=certify)[0]
+    return _with_equilibrium(numeric.model, _run_method(numeric, method=method, certify=certify)[0])
+
+
+def _with_equilibrium(system: Model, analysis: Analysis) -> Analysis:
+    """Return an analysis with the equilibrium at which its model is linearized, if any."""
+    if not system.at_equilibrium:
+        return analysis
+    return replace(analysis, equilibrium=operating_point_from(system))
 
 
 def _run_method(numeric: NumericModel, *, method: str, certify: bool) -> tuple[Analysis, Side]:
@@ -168,7 +176,8 @@ def answer(
         notes = (*notes, not_installed("switching"))
     return AnalysisReport(
         analysis=replace(
-            analysis, notes=(*analysis.notes, *notes, *order_notes, *_published_conditions(system))
+            _with_equilibrium(system, analysis),
+            notes=(*analysis.notes, *notes, *order_notes, *_published_conditions(system)),
         ),
         network=_over_network(numeric, analysis, nominal, certify=certify, requested=margins),
         sensitivities=sensitivity_result,

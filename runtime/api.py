@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from apc.haptics.absolute_stability import AbsoluteStability
     from apc.haptics.frequency_response import Transparency
     from apc.lifting.numeric_model import NumericModel
+    from apc.lifting.rest_position import OperatingPoint
     from apc.mean_square.mean_square_stability import MeanSquareStability
     from apc.network.link_fit import LinkFit
     from apc.parameter_values.parameter_listing import Parameters
@@ -56,6 +57,7 @@ TopologySource = Model | str | Path
 Values = Mapping[str, str | float]  # by the name of a parameter, quantities or numbers in SI
 Format = Literal["text", "json", "dot", "mermaid", "svg"]
 Criterion = Literal["mean-square", "nominal", "passive"]
+Point = Literal["start", "equilibrium"]
 
 
 @checked
@@ -194,6 +196,7 @@ def analyze(
     params: Values | None = None,
     method: Method = "auto",
     certify: bool = False,
+    operating_point: Point = "start",
 ) -> Analysis:
     """Return the stability analysis of a model: verdict, spectral radius, and modes.
 
@@ -210,6 +213,9 @@ def analyze(
         delays; "paper": the lifted matrices of Rakhsha and Constantinescu, eqs. (18) to (20).
     certify
         Whether to prove the verdict in ball arithmetic.
+    operating_point
+        The point of linearization of a nonlinear model: "start", its start values, or "equilibrium" (see
+        `operating_point`), found again at every parameter value that is evaluated.
 
     Returns
     -------
@@ -223,7 +229,61 @@ def analyze(
     """
     from apc.analysis_report import analysis_report
 
-    return analysis_report(_numeric(model, params), method=method, certify=certify)
+    return analysis_report(_numeric(model, params, operating_point), method=method, certify=certify)
+
+
+@checked
+def operating_point(
+    model: TopologySource,
+    *,
+    params: Values | None = None,
+    initial: Literal["start", "simulation"] = "start",
+    duration: str | float | None = None,
+) -> OperatingPoint:
+    """Return the equilibrium of a model: the rest position under its constant forces, contacts included.
+
+    Velocities are 0, forces are balanced, and every received value is the sender's value at rest. A direction
+    without stiffness, such as a common translation, keeps its start value.
+
+    Parameters
+    ----------
+    model, params
+        As for `analyze`.
+    initial
+        The start of the search: "start", the start values of the topology, or "simulation", the end of a
+        simulation.
+    duration
+        The duration of this simulation, as for `simulate`.
+
+    Returns
+    -------
+    OperatingPoint
+        `.positions`, each with name, value in SI and unit; `.active`, whether each contact or limit is on;
+        the `.residual` force in N; `.model`, with the equilibrium as start values.
+
+    Raises
+    ------
+    ApcError
+        The input is invalid. E847 a constant force acts on a body that nothing holds; E848 no convergence;
+        E849 a force depends on time.
+
+    Notes
+    -----
+    The root finder is that of MINPACK (`scipy.optimize.root`), with the exact Jacobian.
+
+    Examples
+    --------
+    >>> rest = apc.operating_point("experiment-average.yaml")
+    >>> [(position.name, position.text) for position in rest.positions][1]
+    ('right.cube.x', '-3 mm')
+    >>> dict(rest.active)["right.contact.push"]
+    True
+    >>> apc.analyze(rest.model).verdict
+    'stable up to a common translation'
+    """
+    from apc.studies import operating_point as equilibrium
+
+    return equilibrium.operating_point(_model(model, params), initial=initial, duration=_duration(duration))
 
 
 @checked
@@ -269,6 +329,7 @@ def critical(
     lower: str | float | None = None,
     upper: str | float | None = None,
     criterion: Criterion | None = None,
+    operating_point: Point = "start",
 ) -> Critical:
     """Return the values of a parameter or delay at which a model becomes stable or unstable.
 
@@ -284,6 +345,8 @@ def critical(
         "mean-square": second moments decay over the lossy network, the default if a link loses or delays
         packets; "nominal": motions decay if every packet is on time; "passive": motions decay with every
         passive hand at every device.
+    operating_point
+        As for `analyze`.
 
     Raises
     ------
@@ -292,7 +355,7 @@ def critical(
     """
     from apc.studies import critical_values
 
-    system = _model(model, params)
+    system = _model(model, params, operating_point)
     low, high = (
         item if item is None or isinstance(item, str) else _si_number(parameter, item)
         for item in (lower, upper)
@@ -372,6 +435,7 @@ def transparency(
     at: str = "",
     between: str = "",
     unstable: bool = False,
+    operating_point: Point = "start",
 ) -> Transparency:
     """Return the impedance at a device, and the transmission of a force to another device.
 
@@ -386,6 +450,8 @@ def transparency(
         two peers.
     unstable
         Whether to return the response of the frame map for an unstable model, which has no steady state.
+    operating_point
+        As for `analyze`.
 
     Returns
     -------
@@ -403,7 +469,7 @@ def transparency(
 
     frequency_list = [frequencies] if isinstance(frequencies, int | float) else frequencies
     return frequency_response.transparency(
-        _numeric(model, params), frequency_list, at=at, between=between, unstable=unstable
+        _numeric(model, params, operating_point), frequency_list, at=at, between=between, unstable=unstable
     )
 
 
@@ -671,6 +737,7 @@ def region(
     x: str | tuple[str, str | float, str | float] | None = None,
     y: str | tuple[str, str | float, str | float] | None = None,
     criterion: Criterion | None = None,
+    operating_point: Point = "start",
     params: Values | None = None,
 ) -> Region:
     """Return the boundary of the stable region of two parameters, as curves with their errors.
@@ -684,6 +751,8 @@ def region(
         ("contact.stiffness", 10, 3000); by default the axes of the model's `studies: region:`.
     criterion
         As for `critical`.
+    operating_point
+        As for `analyze`.
 
     Returns
     -------
@@ -699,7 +768,7 @@ def region(
     from apc.regions import stable_region
     from apc.regions.axes import parse_axes
 
-    system = _model(model, params)
+    system = _model(model, params, operating_point)
     first, second = (
         axis if axis is None or isinstance(axis, str) else f"{axis[0]}={_range(system, axis[0], axis[1:])}"
         for axis in (x, y)
@@ -719,6 +788,7 @@ def tune(
     over: Mapping[str, str | Sequence[str | float]] | None = None,
     criterion: Criterion | None = None,
     seconds: float | None = None,
+    operating_point: Point = "start",
     params: Values | None = None,
 ) -> Tuning:
     """Return the optimal gains under a specification, with a proof that they satisfy it.
@@ -743,6 +813,8 @@ def tune(
         the topology's `studies: tune:`.
     seconds
         The time limit.
+    operating_point
+        As for `analyze`.
 
     Returns
     -------
@@ -754,9 +826,11 @@ def tune(
     ApcError
         The input is invalid.
     """
+    from apc.lifting.rest_position import linearized_at
     from apc.tuning import tuner
 
     system, tuning_spec = _tuning_spec(model, params, free, over, criterion, maximize, minimize, constraint)
+    system = linearized_at(system, operating_point)
     return tuner.tune(system, tuning_spec, seconds=float("inf") if seconds is None else seconds)
 
 
@@ -910,20 +984,25 @@ def _path(topology: TopologySource, function: str) -> Path:
     return path
 
 
-def _model(model: TopologySource, params: Values | None) -> Model:
-    """Return the compiled model, with parameter values changed."""
+def _model(model: TopologySource, params: Values | None, operating_point: Point = "start") -> Model:
+    """Return the compiled model, with parameter values changed, and linearized at an operating point."""
     if not isinstance(model, Model):
         from apc.inputs.open_model import load_or_compile
 
         model = load_or_compile(Path(model))
-    return set_parameters(model, params) if params else model
+    changed = set_parameters(model, params) if params else model
+    if operating_point == "start":
+        return changed
+    from apc.lifting.rest_position import linearized_at
+
+    return linearized_at(changed, operating_point)
 
 
-def _numeric(model: TopologySource, params: Values | None) -> NumericModel:
-    """Return the model at its parameter values, with parameter values changed."""
+def _numeric(model: TopologySource, params: Values | None, operating_point: Point = "start") -> NumericModel:
+    """Return the model at its parameter values, with parameter values changed, and its operating point."""
     from apc.lifting.numeric_model import numeric_model
 
-    return numeric_model(_model(model, params))
+    return numeric_model(_model(model, params, operating_point))
 
 
 def _check_out(model: TopologySource, system: Model, path: Path | None) -> None:
@@ -997,16 +1076,24 @@ def simulate(
             duration = float(push.WATCHED)
     if trace_of is not None:
         system = require_extension("loss_models").worst_trace(system)
-    length = duration if duration is None or isinstance(duration, str) else f"{float(duration)!r} s"
     return trajectory.simulate(
         system,
-        duration=trajectory.parse_duration(length) if length is not None else None,
+        duration=_duration(duration),
         signals=signals,
         jit=jit,
         seed=seed,
         method=parse_method(method) if method is not None else DEFAULT,
         error=error,
     )
+
+
+def _duration(duration: str | float | None) -> Fraction | None:
+    """Return a duration in seconds, None if none is given."""
+    if duration is None:
+        return None
+    from apc.simulation.trajectory import parse_duration
+
+    return parse_duration(duration if isinstance(duration, str) else f"{float(duration)!r} s")
 
 
 @checked

@@ -25,7 +25,9 @@ from apc.compiler.compiled import LENGTH, Model
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.timings import part
 from apc.lifting.discretize import TOO_LARGE
+from apc.lifting.equilibrium_equations import depends_on_time
 from apc.lifting.numeric_model import NumericModel, linearized_at_start
+from apc.lifting.rest_position import OperatingPoint, equilibrium_moves, equilibrium_note
 from apc.linearization.evaluation_errors import finite_equations
 from apc.network.nominal_criterion import limitations, unreliable
 from apc.parameter_values.parameter_names import ParameterRef
@@ -55,6 +57,11 @@ NOT_LINEAR = (
     "nonlinear topology: the result holds near the initial state, with the contacts and limits that are "
     "active there"
 )
+AT_REST = NOT_LINEAR.replace("initial state", "equilibrium")
+
+# What a start that is not at rest admits: a simulation; without forces that depend on time, an equilibrium.
+SIMULATED = "for the motion over time, run apc simulate"
+AT_EQUILIBRIUM = "for its equilibrium, run apc analyze --operating-point equilibrium"
 
 SETTLED = 0.02  # of the initial deviation: below it a motion counts as settled
 
@@ -70,7 +77,8 @@ class Analysis(Result):
     `rotations` are motions; the others belong to the unobservable memories named in `unobservable`.
     `radius_excess` bounds the spectral radius less 1 from below and above if that was proved, closer than two
     floats can. `sides` are the verdicts of all sides of the kinks at which peers start, empty without kinks;
-    the analysis is that of the worst side.
+    the analysis is that of the worst side. `equilibrium` is the point of linearization of a
+    requested analysis, None at the start values, and in the analyses of a search.
     """
 
     shown_by = "analysis_output:analysis"
@@ -95,6 +103,7 @@ class Analysis(Result):
     unobservable: tuple[str, ...] = ()
     radius_excess: tuple[float, float] | None = None
     sides: tuple[SideVerdict, ...] = ()
+    equilibrium: OperatingPoint | None = None
 
     def plot(self, ax: Any = None, **style: Unpack[PlotStyle]) -> Any:
         """Draw the eigenvalues and the unit circle into matplotlib Axes, or a new figure, in the style
@@ -120,8 +129,8 @@ class Analysis(Result):
 def prepare_at_start(numeric: NumericModel, varied: Sequence[ParameterRef] = ()) -> NumericModel | None:
     """Return a model with every peer type linearized at its start, as functions of its parameters.
 
-    None if that is impossible (see `numeric_model.linearized_at_start`), or if peers start at a kink: each
-    point is then analyzed on all sides.
+    None if that is impossible (see `numeric_model.linearized_at_start`), if peers start at a kink, as each
+    point is then analyzed on all sides, or if the start is an equilibrium that varies.
 
     Parameters
     ----------
@@ -138,6 +147,8 @@ def prepare_at_start(numeric: NumericModel, varied: Sequence[ParameterRef] = ())
     refuse_varying(numeric.model, numeric.jacobians)
     if sides(numeric)[0].numeric is not numeric:
         return None
+    if numeric.model.at_equilibrium and not numeric.affine and equilibrium_moves(numeric.model, varied):
+        return None
     return linearized_at_start(numeric, varied)
 
 
@@ -149,15 +160,20 @@ def near_start(numeric: NumericModel) -> tuple[str, ...]:
     numeric
         The model with its parameter values.
     """
-    elements = replaced_elements(numeric.model)
+    at_rest = numeric.model.at_equilibrium
+    elements = (*equilibrium_note(numeric.model), *replaced_elements(numeric.model))
     if numeric.affine:
         return elements
     try:
         all_sides = sides(numeric)
         groups, _ = lifted_groups(all_sides[0].numeric)
     except ApcError:  # no result with these values
-        return (*elements, NOT_LINEAR)
-    return (*_kink_limitation([side.name for side in all_sides]), *elements, *_start_limitations(groups))
+        return (*elements, AT_REST if at_rest else NOT_LINEAR)
+    return (
+        *_kink_limitation([side.name for side in all_sides]),
+        *elements,
+        *_start_limitations(groups, at_rest=at_rest),
+    )
 
 
 def _kink_limitation(names: Sequence[str]) -> tuple[str, ...]:
@@ -168,13 +184,23 @@ def _kink_limitation(names: Sequence[str]) -> tuple[str, ...]:
     return (f"the start is at a kink ({shown}): the worst side decides",)
 
 
-def _start_limitations(groups: Sequence[PeerClass]) -> tuple[str, ...]:
-    """Return the limitations of a linearized model: a motion at the start values, and the nonlinearity."""
+def _start_limitations(groups: Sequence[PeerClass], *, at_rest: bool) -> tuple[str, ...]:
+    """Return the limitations of a linearized model: a motion at the start values, and the nonlinearity.
+
+    Parameters
+    ----------
+    groups
+        The classes of peers, linearized.
+    at_rest
+        Whether the start values are those of the equilibrium, where nothing moves.
+    """
+    if at_rest:
+        return (AT_REST,)
     moves = equilibrium_residual(groups)
-    return (
-        *([f"{moves}; for the motion over time, run apc simulate"] if moves else []),
-        NOT_LINEAR,
-    )
+    if not moves:
+        return (NOT_LINEAR,)
+    timed = any(depends_on_time(group.jacobians.peer_type) for group in groups)
+    return f"{moves}; {SIMULATED if timed else f'{SIMULATED}; {AT_EQUILIBRIUM}'}", NOT_LINEAR
 
 
 @part("analysis")
@@ -360,7 +386,7 @@ def _analyze(side: Side, *, method: str, certify: bool, exact_work: float) -> An
         proof=proof,
         limitations=(
             *elements,
-            *(_start_limitations(plan.groups) if nonlinear else ()),
+            *(_start_limitations(plan.groups, at_rest=system.at_equilibrium) if nonlinear else ()),
             *limitations(system),
         ),
         unobservable=neutral_modes.names,

@@ -62,6 +62,7 @@ def analyze_command(
     ),
     modes: str = option("Rows of the mode table.", type=click.Choice(("slowest", "all")), default="slowest"),
     hands: str,
+    operating_point: str,
     plot: Path | None = picture_option("Plot the eigenvalues (.png, .svg, .pdf)."),
     as_json: bool,
 ) -> None:
@@ -85,7 +86,15 @@ def analyze_command(
 
     if cells is not None and not box and hands in (*HANDS, PASSIVE):  # hands of the library make a box
         raise click.UsageError("--cells requires --box")
-    system = open_topology(file, settings, {"--plot": plot}, hands=hands, varied=box, notify=note_aside)
+    system = open_topology(
+        file,
+        settings,
+        {"--plot": plot},
+        hands=hands,
+        operating_point=operating_point,
+        varied=box,
+        notify=note_aside,
+    )
     if hands == PASSIVE:
         requested = {
             "--method": method != AUTO,

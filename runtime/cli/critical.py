@@ -50,6 +50,7 @@ def critical_command(
     ),
     criterion: str | None,
     hands: str,
+    operating_point: str,
     plot: Path | None = picture_option("Plot the root locus (.png, .svg, .pdf)."),
     as_json: bool,
 ) -> None:
@@ -70,7 +71,13 @@ def critical_command(
         message = "--plot is not available with --hands passive, which computes no eigenvalues"
         raise ApcError(Diagnostic("E930", SourceLocation("--hands"), message, fix="--hands clamped"))
     system = open_topology(
-        file, settings, {"--plot": plot}, hands=hands, varied=(path, *over), notify=note_aside
+        file,
+        settings,
+        {"--plot": plot},
+        hands=hands,
+        operating_point=operating_point,
+        varied=(path, *over),
+        notify=note_aside,
     )
     if over:
         if plot is not None:

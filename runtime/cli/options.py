@@ -110,6 +110,12 @@ SHARED: dict[str, Callable[[inspect.Parameter], click.Parameter]] = {
     "hands": option(
         "Operator model: free, clamped, held, passive, or a hand of the library.", "HANDS", default="free"
     ),
+    "operating_point": option(
+        "Point of linearization: start (start values) or equilibrium (rest position).",
+        "POINT",
+        type=click.Choice(("start", "equilibrium")),
+        default="start",
+    ),
     "duration": option("Duration.", '"TIME"', show_default="experiment: duration"),
     "as_json": option("Print JSON instead of text.", name="--json"),
 }

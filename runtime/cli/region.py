@@ -46,6 +46,7 @@ def region_command(
     cells: int = option("Initial cells along each side.", "N", type=WholeNumber(2, 256), default=12),
     criterion: str | None,
     hands: str,
+    operating_point: str,
     out: Path | None = result_option(),
     as_json: bool,
 ) -> None:
@@ -72,7 +73,15 @@ def region_command(
     note_typical_hand(hands)
     varied = [text for text in (x, y, *itertools.chain(*listed)) if text]
     systems = [
-        open_topology(text, settings, {"--out": out}, hands=hands, varied=varied, notify=note_aside)
+        open_topology(
+            text,
+            settings,
+            {"--out": out},
+            hands=hands,
+            operating_point=operating_point,
+            varied=varied,
+            notify=note_aside,
+        )
         for text in (file, *compare)
     ]
     with status_line() as progress:

@@ -25,6 +25,7 @@ def transparency_command(
     *,
     file: str | None,
     settings: tuple[str, ...],
+    operating_point: str,
     at: str = option(
         "Device, or an axis of it, e.g. left[1].device.x[2].", "PEER.PART", show_default="first device"
     ),
@@ -69,7 +70,7 @@ def transparency_command(
         raise click.UsageError("--at can't be combined with another device A of --between A:B")
     if nyquist and (out is None or out.suffix.lower() not in FORMATS):
         raise click.UsageError(f"--nyquist requires --out with {', '.join(FORMATS)}")
-    system = open_topology(file, settings, {"--out": out}, notify=note_aside)
+    system = open_topology(file, settings, {"--out": out}, operating_point=operating_point, notify=note_aside)
     with at_work(f"computing the impedance for {counted(system.peers, 'peer')}"):
         hertz = read_frequencies(system, frequencies, low, high, points)
         result = transparency(

@@ -48,6 +48,7 @@ def tune_command(
         "Operating range: user.count=2:10, device.mass=±20%, lan.loss=0:0.05 (repeatable).", "PATH=LO:HI"
     ),
     hands: str,
+    operating_point: str,
     time: str = option("Time limit of the search.", '"TIME"', show_default="no limit"),
     settings: tuple[str, ...],
     write: Path | None = option("Write the topology with the tuned gains (.yaml)."),
@@ -78,6 +79,7 @@ def tune_command(
     """
     from apc.inputs.open_model import open_topology
     from apc.lifting.devices import FREE
+    from apc.lifting.rest_position import linearized_at
     from apc.output.pictures import write_picture
     from apc.output.tuning_output import panels_of
     from apc.support.extension_table import require_extension
@@ -110,6 +112,7 @@ def tune_command(
     criterion = criterion_with(hands, None)
     if hands == FREE:
         system, criterion = gripped_as_studied(system)
+    system = linearized_at(system, operating_point)  # with the hands of the study
     tuning_spec = read_tuning_spec(
         system,
         free,

@@ -123,6 +123,7 @@ class AbsoluteStability(Result):
     why: str
     proof: StabilityProof
     linearized: bool
+    at_equilibrium: bool
     limitations: tuple[str, ...]
 
     @property
@@ -243,6 +244,7 @@ def _one_sided_hand_conditions(
         why=never_reason,
         proof=proof,
         linearized=not linear,
+        at_equilibrium=numeric.model.at_equilibrium,
         limitations=(),
     )
 

@@ -98,6 +98,7 @@ class Transparency(Result):
     h2: tuple[H2Gains, ...]
     stable: bool | None
     linearized: bool
+    at_equilibrium: bool
     limitations: tuple[str, ...]
     notes: tuple[Limitation, ...]
 
@@ -218,6 +219,7 @@ def transparency(
         h2=h2,
         stable=verdict.stable,
         linearized=not linear,
+        at_equilibrium=system.at_equilibrium,
         limitations=(*near_start(numeric), *limitations(system)),
         notes=tuple(limitation for limitation, applies in applicable.items() if applies),
     )

@@ -127,6 +127,7 @@ def open_topology(
     outputs: Mapping[str, Path | None] | None = None,
     *,
     hands: str = "free",
+    operating_point: str = "start",
     varied: Iterable[str] = (),
     notify: Callable[[str], None] | None = None,
 ) -> Model:
@@ -142,6 +143,8 @@ def open_topology(
         The output files of the command, by option: see `check_outputs`.
     hands
         The treatment of hands, see `devices.with_hands`.
+    operating_point
+        The point of linearization, see `rest_position.linearized_at`.
     varied
         The varied parameters of the command, each a text that begins with a name.
     notify
@@ -151,7 +154,8 @@ def open_topology(
     ------
     ApcError
         As `find_input`, `load_or_compile`, `check_outputs`, `devices.with_hands`,
-        `devices.refuse_numberless`, `overrides.parse_override` and `overrides.apply`.
+        `devices.refuse_numberless`, `overrides.parse_override`, `overrides.apply` and
+        `rest_position.linearized_at`.
     """
     path = find_input(file, compiled_too=True)
     system = load_or_compile(path)
@@ -161,8 +165,17 @@ def open_topology(
 
         system = with_hands(system, hands)
         refuse_numberless(hands, (*settings, *varied))
-    if not settings:
-        return system
+    if settings:
+        system = _with_settings(system, settings, notify)
+    if operating_point != "start":
+        from apc.lifting.rest_position import linearized_at
+
+        system = linearized_at(system, operating_point)
+    return system
+
+
+def _with_settings(system: Model, settings: Sequence[str], notify: Callable[[str], None] | None) -> Model:
+    """Return a model with the settings of a command; arguments and errors as in `open_topology`."""
     from apc.parameter_values.overrides import apply, parse_override
     from apc.parameter_values.parameter_names import OVERRIDE, notes_for_all_groups
 

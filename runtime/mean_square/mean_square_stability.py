@@ -93,6 +93,7 @@ class MeanSquareStability(Result):
     almost_sure: TopLyapunovExponent | None
     losses_in_a_row: ConsecutiveLosses | None
     linearized: bool
+    at_equilibrium: bool
     notes: tuple[str, ...]
 
 
@@ -349,6 +350,7 @@ def _mean_square_stability(numeric: NumericModel, *, certify: bool) -> MeanSquar
         almost_sure=exponent,
         losses_in_a_row=worst,
         linearized=not linear,
+        at_equilibrium=system.at_equilibrium,
         notes=tuple(text for text in notes if text),
     )
 

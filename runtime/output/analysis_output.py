@@ -23,7 +23,6 @@ import numpy as np
 
 from apc.compiler.wording import counted, in_hertz, wrapped
 from apc.output.formatting import (
-    LINEARIZED,
     NEAR,
     Lines,
     Plain,
@@ -34,6 +33,7 @@ from apc.output.formatting import (
     listed,
     notes,
     picked,
+    point_text,
     quantity,
     radius_text,
     record,
@@ -41,6 +41,7 @@ from apc.output.formatting import (
     table,
 )
 from apc.output.margins_output import margins_lines, sensitivities_lines
+from apc.output.operating_point_output import rest_lines
 from apc.output.pictures import COLOURS, legend_below, new_figure
 from apc.support.optional import need
 from apc.verdict import StabilityVerdict
@@ -165,8 +166,9 @@ def _summary(result: Analysis, warnings: Sequence[str] = ()) -> Lines:
         words += " For the motion over time, run: apc simulate"
     if not result.states_per_peer:
         words = "The topology has no free motion."
+    at_equilibrium = result.equilibrium is not None
     yield from wrapped(
-        f"{result.topology}: {result.verdict}{LINEARIZED if result.linearized else ''}", "", "  "
+        f"{result.topology}: {result.verdict}{point_text(result.linearized, at_equilibrium)}", "", "  "
     )
     yield from warning_lines(warnings)
     yield from notes(*result.limitations)
@@ -198,7 +200,15 @@ def _summary(result: Analysis, warnings: Sequence[str] = ()) -> Lines:
         ("proof", str(result.proof)),
     )
     if result.sides:
-        yield from headed("Sides of the kinks at the initial state", _side_table(result))
+        point = "equilibrium" if at_equilibrium else "initial state"
+        yield from headed(f"Sides of the kinks at the {point}", _side_table(result))
+    yield from _equilibrium_lines(result)
+
+
+def _equilibrium_lines(result: Analysis) -> Lines:
+    """Yield the equilibrium at which an analysis is linearized, if any."""
+    if result.equilibrium is not None:
+        yield from headed("Equilibrium", rest_lines(result.equilibrium))
 
 
 def _side_table(result: Analysis) -> Lines:
@@ -237,6 +247,7 @@ def answer_text(answer: AnalysisReport) -> Lines:
         yield ""
     if answer.network is not None and not answer.nominal:
         yield from _in_short(analysis)
+        yield from _equilibrium_lines(analysis)
     else:
         yield from _summary(analysis, warnings)
         yield from margins_lines(answer.margins)
@@ -526,7 +537,7 @@ def contact_modes_text(contact_modes: ContactModes) -> Lines:
     yield ""
     yield from table(rows, "<><<")
     if any(mode.linearized for mode in contact_modes.modes):
-        yield "\n  * linearized at the initial state: this mode is nonlinear"
+        yield "\n  * linearized: this mode is nonlinear"
     reasons = (f"not analyzed: {', '.join(names)}: {why}" for why, names in refused.items())
     yield from notes(*reasons, *contact_modes.notes)
 

@@ -2,8 +2,8 @@
 
 Takes: frozen values, texts.
 Gives: `Plain`, `document`, `record`, `picked`, `reached`, `json_text`; `full_digits`, `radius_text`,
-`quantity`, `with_error`, `uncertain`, `span`, `axis_label`, `listed`; `Lines`, `notes`, `sentences`,
-`labelled`, `headed`, `table`; `MEANT`.
+`quantity`, `with_error`, `uncertain`, `span`, `axis_label`, `listed`, `point_text`; `Lines`, `notes`,
+`sentences`, `labelled`, `headed`, `table`; `MEANT`.
 Guarantees: a document is made of what JSON has words for; the same value gives the same text; a line is at
 most 80 columns wide where its words allow it.
 Does not: know a result.
@@ -42,7 +42,7 @@ Lines = Iterator[str]
 # A number nearer to 1 is printed by its distance from 1, with this number of digits at most.
 NEAR, REPORTED = 1e-6, 1e-4
 
-LINEARIZED = ", linearized at the initial state"
+LINEARIZED = ", linearized at the {}"
 
 # Significant digits of a number in text.
 DIGITS = 6
@@ -190,6 +190,11 @@ def span(low: float, high: float, unit: str) -> str:
 def axis_label(name: str, unit: str) -> str:
     """Return the label of an axis: quantity and unit."""
     return name if unit == "1" else f"{name} [{unit.replace('*', '·')}]"
+
+
+def point_text(linearized: bool, at_equilibrium: bool) -> str:
+    """Return the words for the point of linearization of a result, "" for a linear model."""
+    return LINEARIZED.format("equilibrium" if at_equilibrium else "initial state") if linearized else ""
 
 
 def listed(names: Sequence[str], most: int = 6) -> str:

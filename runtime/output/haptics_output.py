@@ -17,13 +17,13 @@ from numpy.typing import NDArray
 
 from apc.compiler.wording import known_digits, wrapped
 from apc.output.formatting import (
-    LINEARIZED,
     Lines,
     Plain,
     document,
     headed,
     labelled,
     notes,
+    point_text,
     radius_text,
     record,
     sentences,
@@ -60,9 +60,9 @@ NOISE_RMS = "at clock ticks (motion between ticks is not included)"
 
 def passive_text(absolute_stability: AbsoluteStability) -> Lines:
     """Yield whether a model is stable with any passive hands, in words and numbers."""
+    point = point_text(absolute_stability.linearized, absolute_stability.at_equilibrium)
     yield from wrapped(
-        f"{absolute_stability.topology}: "
-        f"{absolute_stability.verdict}{LINEARIZED if absolute_stability.linearized else ''}",
+        f"{absolute_stability.topology}: {absolute_stability.verdict}{point}",
         "",
         "  ",
     )
@@ -150,7 +150,9 @@ def passive_document(absolute_stability: AbsoluteStability) -> Plain:
 
 def transparency_text(transparency: Transparency) -> Lines:
     """Yield the impedance at a device, transmitted velocity, coordination error and norms."""
-    title = f"impedance at {transparency.at}{LINEARIZED if transparency.linearized else ''}"
+    title = (
+        f"impedance at {transparency.at}{point_text(transparency.linearized, transparency.at_equilibrium)}"
+    )
     yield from wrapped(f"{transparency.topology}: {title}", "", "  ")
     yield from notes(*transparency.limitations)
     slow = transparency.low_frequency

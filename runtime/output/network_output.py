@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from apc.compiler.wording import counted, wrapped
-from apc.output.formatting import LINEARIZED, Lines, Plain, labelled, notes, radius_text, record, sentences
+from apc.output.formatting import Lines, Plain, labelled, notes, point_text, radius_text, record, sentences
 
 if TYPE_CHECKING:
     from apc.mean_square.loss_results import ConsecutiveLosses
@@ -32,7 +32,8 @@ def network_text(result: MeanSquareStability) -> Lines:
     """Yield the mean-square verdict of a model, in words and numbers."""
     radius = result.mean_square_radius
     where = " over its network" if radius is None else ""
-    yield f"{result.topology}: {result.verdict}{where}{LINEARIZED if result.linearized else ''}"
+    point = point_text(result.linearized, result.at_equilibrium)
+    yield f"{result.topology}: {result.verdict}{where}{point}"
     yield ""
     if radius is not None:
         yield from sentences(_WORDS[result.stable].format(", apart from free common translations"))

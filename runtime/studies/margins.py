@@ -145,7 +145,9 @@ def margins(numeric: NumericModel, *, quick: bool = False, analysis: Analysis | 
         delays = _delays(system)
         start = prepare_at_start(numeric, [*parameter_refs, *delays])
         linearized = start or numeric
-        delays = delays if start is not None else []
+        # Times do not change an equilibrium, at which a delay then finds one linearization.
+        for_delays = prepare_at_start(numeric, delays) if system.at_equilibrium else start
+        delays = delays if for_delays is not None else []
         first_side = sides(linearized)[0]  # all sides have the same states
         states = _loop_sizes(first_side.numeric, most=MOST_IN_PASSING if quick else math.inf)
         if not states:
@@ -168,9 +170,12 @@ def margins(numeric: NumericModel, *, quick: bool = False, analysis: Analysis | 
         rows = [
             _margin(system, parameter_ref, search(path, first=True)) for parameter_ref, path in paths if path
         ]
-        rows += [*skipped, *(_delay_margin(linearized, delay, largest, now) for delay in delays)]
+        rows += [
+            *skipped,
+            *(_delay_margin(for_delays or linearized, delay, largest, now) for delay in delays),
+        ]
         result = tuple(filter(None, rows))
-        return Margins(result, _common_note(result, start))
+        return Margins(result, _common_note(result, for_delays))
 
 
 def _loop_sizes(numeric: NumericModel, *, most: float) -> list[int]:

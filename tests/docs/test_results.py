@@ -25,14 +25,18 @@ from tests.commands import Cli
 from tests.topologies import ROOT
 
 PAGE = ROOT / "docs" / "reference" / "results.md"
-AVERAGE, LOSSY = (
-    ROOT / "models" / "topologies" / f"{name}-average.yaml" for name in ("three-users", "lossy")
+AVERAGE, LOSSY, EXPERIMENT = (
+    ROOT / "models" / "topologies" / f"{name}-average.yaml" for name in ("three-users", "lossy", "experiment")
 )
 BOX = '--box "contact.stiffness=990 N/m:1000 N/m"'
 FREE = '--free "coordination.stiffness=10 N/m:1000 N/m" --maximize coordination.stiffness'
 AXES = '--x "contact.stiffness=1000 N/m:2000 N/m" --y "coordination.stiffness=400 N/m:500 N/m"'
 COMMANDS = {
-    "apc analyze": [f"{AVERAGE} --event-order {BOX}", f"{LOSSY}"],
+    "apc analyze": [
+        f"{AVERAGE} --event-order {BOX}",
+        f"{LOSSY}",
+        f"{EXPERIMENT} --operating-point equilibrium --no-margins",
+    ],
     "apc analyze --changing": [f"user.count=2:3 {AVERAGE}", f"user.count=2:5 {AVERAGE}"],
     "apc analyze --hands passive": [f"{AVERAGE}"],
     "apc critical": [f"contact.stiffness {AVERAGE}", f"contact.stiffness {LOSSY}"],
