@@ -132,7 +132,9 @@ def equilibrium_note(system: Model) -> tuple[str, ...]:
         return ()
     positions = operating_point_from(system).positions
     shown = [f"{position.name} = {position.text}" for position in positions[:MOST_NOTED]]
-    return (f"equilibrium: {', '.join([*shown, *['…'][: len(positions) - MOST_NOTED]])}",)
+    return (
+        f"equilibrium at the present values: {', '.join([*shown, *['…'][: len(positions) - MOST_NOTED]])}",
+    )
 
 
 def at_equilibrium(system: Model) -> Model:

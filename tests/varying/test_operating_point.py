@@ -189,7 +189,10 @@ def test_a_critical_value_at_a_fixed_equilibrium_is_that_of_the_local_stiffness(
     local, name = {"contact.stiffness": hertz()}, "device.damping"
     found = apc.critical(compiled(PRESSED), name, operating_point="equilibrium")
     assert found.value == pytest.approx(apc.critical(compiled(SPRING), name, params=local).value, rel=1e-6)
-    assert any(text.startswith("equilibrium: device.x = -2.82311 mm") for text in found.limitations)
+    assert any(
+        text.startswith("equilibrium at the present values: device.x = -2.82311 mm")
+        for text in found.limitations
+    )
 
 
 def test_the_equilibrium_is_found_again_at_every_value_of_a_parameter() -> None:
