@@ -172,6 +172,27 @@ hands: {push: {type: ConstantForce, flange: device, force: 3 N}}
     )
 
 
+def test_a_nonlinear_loop_has_an_equilibrium(tmp_path: Path) -> None:
+    """f + f³/N² = k x with f = 2 N at rest; there df/dx = k/(1 + 3 f²/N²)."""
+    part = """\
+component: SoftSpring
+description: A spring that becomes softer with its force.
+connectors: {flange: Flange}
+parameters: {stiffness: {unit: N/m}, soft: {unit: 1/N^2}}
+variables: {f: {unit: N}}
+equations: [f + soft*f^3 = stiffness*flange.x, flange.f = f]
+"""
+    spring = "  soft: {type: SoftSpring, flange: device, stiffness: 500 N/m, soft: 1 1/N^2}\n"
+    text = WALL.format(force=2).replace("stiffness: 100 N/m", "stiffness: 0 N/m")
+    text = text.replace("150 N/m", "0 N/m").replace("hands:", f"{spring}hands:").replace("4 mm", "1 m")
+    system = compiled(text, library(tmp_path, part))
+    assert positions(apc.operating_point(system))["device.x"] == pytest.approx((2 + 2**3) / 500, rel=1e-12)
+    linear = compiled(WALL.format(force=2).replace("4 mm", "1 m").replace("150 N/m", "0 N/m"))
+    local = apc.analyze(linear, params={"first.stiffness": 500 / 13}).spectral_radius
+    found = apc.analyze(system, operating_point="equilibrium").spectral_radius
+    assert found == pytest.approx(local, rel=1e-12)
+
+
 def test_an_analysis_at_the_equilibrium_is_that_of_the_local_stiffness() -> None:
     analysis = apc.analyze(compiled(PRESSED), operating_point="equilibrium")
     linear = apc.analyze(compiled(SPRING), params={"contact.stiffness": hertz()})
