@@ -43,7 +43,7 @@ OPERATING_POINTS = (START, EQUILIBRIUM)
 
 SHORT = 0.1  # m: shorter lengths are displayed in mm
 MOST_NOTED = 6  # positions in one line
-CACHE_SIZE = 32
+CACHE_SIZE = 32  # models with cached equilibria
 
 Floats = NDArray[np.float64]
 

@@ -21,7 +21,7 @@ from apc.compiler.compiled import Hold, Model, Parameter, PeerColumn, PeerType, 
 from apc.lifting.devices import rewritten
 from apc.lifting.model_numbers import PeerIndices
 
-CACHE_SIZE = 64
+CACHE_SIZE = 64  # peer types with cached functions of start values
 
 
 def start_parameters(peer_type: PeerType) -> list[str]:

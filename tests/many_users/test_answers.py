@@ -24,6 +24,7 @@ def test_the_answer_is_plain_data() -> None:
         *("topology", "peers", "frame_s", "states_per_peer", "method", "verdict", "stable"),
         *("spectral_radius", "spectral_radius_error", "rigid_modes", "modes", "linearized", "notes", "proof"),
         *("limitations", "translations", "rotations", "unobservable", "radius_excess", "sides"),
+        "equilibrium",
     ]
     assert (found["peers"], found["frame_s"], found["states_per_peer"]) == (3, 0.008, 8)
     first = found["modes"][0]

@@ -19,6 +19,7 @@ CALLS = (
     "analyze --hands held --set hand.stiffness=100_N/m",
     "analyze --hands StylusArmForward --no-margins",
     "analyze --operating-point equilibrium --no-margins",
+    "analyze --changing COUNT=2:3",
     "analyze --certify --no-margins",
     "analyze --method dense --no-margins",
     "analyze --method determinant --no-margins",
