@@ -1,7 +1,7 @@
 """Tables in CSV files: columns with their units in the headings.
 
-Takes: a path. Gives: `read_table`, a `Table` in SI of `CsvColumn`s; `open_table`, `read_bytes`, for files
-whose cells are not all numbers; `NamedFiles`.
+Takes: a path. Gives: `read_table`, a `Table` in SI of `CsvColumn`s; `open_table`, `parse_headings`, `read_bytes`,
+for files whose cells are not all numbers; `NamedFiles`.
 Guarantees: every cell is a finite number, or an error names its file, line and column. The text of a file
 that is not a table is never printed, as it may be private. A number takes eight bytes.
 Does not: interpret columns.
@@ -207,7 +207,7 @@ def open_table(
     first: list[str] = []
     try:
         first = next(rows, [])
-        yield CsvReader(name, _headings(first, name, example), rows)
+        yield CsvReader(name, parse_headings(first, name, example), rows)
     except csv.Error as error:
         raise fault("E703", SourceLocation(name, rows.line_num or 1, 1), f"invalid CSV: {error}") from None
     except ApcError:
@@ -253,7 +253,7 @@ def read_bytes(file: InputFile, named_at: SourceLocation, *, any_text: bool = Fa
     raise fault("E701", named_at, message)
 
 
-def _headings(texts: list[str], file: str, example: str) -> Headings:
+def parse_headings(texts: list[str], file: str, example: str) -> Headings:
     """Return name, unit and location of each heading. Raises ApcError (E702) for invalid headings."""
     location = SourceLocation(file, 1, 1)
     if not any(text.strip() for text in texts):

@@ -8,9 +8,7 @@ Does not: compute.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
@@ -24,13 +22,8 @@ from apc.cli.options import (
     print_result,
 )
 from apc.cli.progress import status_line
-from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from apc.compiler.compiled import Model
-    from apc.tuning.tuner import Tuning
+from apc.cli.topology_writing import check_topology_name, write_values
+from apc.compiler.errors import ApcError
 
 
 @command
@@ -87,18 +80,7 @@ def tune_command(
     from apc.tuning.tuner import tune
 
     note_typical_hand(hands)
-    if write is not None and write.suffix not in (".yaml", ".yml"):
-        message, got = "suffix of --write", write.suffix or "none"
-        raise ApcError(
-            Diagnostic(
-                "E996",
-                SourceLocation(str(write)),
-                message,
-                ".yaml",
-                got,
-                f"--write {write.stem}-tuned.yaml",
-            )
-        )
+    check_topology_name(write, "tuned")
     if write is not None and tradeoff:
         raise click.UsageError("--write can't be combined with --tradeoff")
     system = open_topology(
@@ -138,7 +120,8 @@ def tune_command(
     refused: ApcError | None = None
     if write is not None and tuning.feasible:
         try:
-            _write(system, tuning, settings, write)
+            values = {gain.parameter: (float(gain.value), gain.unit) for gain in tuning.gains}
+            write_values(system, values, settings, write)
         except ApcError as error:  # the gains are shown all the same
             refused = error
     if plot is not None:
@@ -147,27 +130,3 @@ def tune_command(
     print_result(tuning, as_json=as_json, written=[written, plot])
     if refused is not None:
         raise refused
-
-
-def _write(system: Model, tuning: Tuning, settings: Sequence[str], path: Path) -> None:
-    """Write the topology with the gains and the settings."""
-    from apc.app.yaml_edit import write_topology
-    from apc.compiler.pipeline import compile_again
-    from apc.compiler.wording import with_unit
-    from apc.parameter_values.overrides import parse_override
-    from apc.parameter_values.parameter_names import HELD, find
-
-    as_written = compile_again(replace(system.origin, changes=()), path.parent)
-    # The numbers of the hand of --hands held are of no topology.
-    names = {setting.partition("=")[0].strip() for setting in settings} - set(HELD)
-    names |= {parameter.name for parameter in as_written.parameters}
-    values = {
-        parse_override(as_written, setting).free: setting.partition("=")[2].strip()
-        for setting in settings
-        if setting.partition("=")[0].strip() in names
-    }
-    for gain in tuning.gains:
-        number = f"{float(gain.value):.12g}"
-        values[find(as_written, gain.parameter)] = with_unit(number, gain.unit).removesuffix(" 1")
-    (text,) = (text for name, text in system.origin.texts if name == system.origin.topology)
-    write_topology(path, text.decode(), as_written, values)

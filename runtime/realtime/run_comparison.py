@@ -1,6 +1,7 @@
 """Comparison of a real-time run with simulation (same packet arrivals) and analysis (measured network).
 
-Takes: a `RealtimeRun`. Gives: `RunComparison`, `compare_run`; `ArcRun`, `Ticks`, `ticks_of`; `MeasuredLink`.
+Takes: a `RealtimeRun`. Gives: `RunComparison`, `compare_run`; `ArcRun`, `Ticks`, `ticks_of`; `MeasuredLink`;
+`DeliveredRun`, `reason_not_simulated`.
 Guarantees: the simulation is that of `simulate` with the recorded packets in effect at each tick. Without the
 complete record of a peer there is no simulation, and the reason is given.
 Does not: write files (see `run`).
@@ -133,7 +134,7 @@ def compare_run(run: RealtimeRun) -> RunComparison:
     system, peers = run.system, run.peers
     simulation = prepare(live_topology(system), Settings(_duration(peers), jit=False))
     frame = float(simulation.frame * simulation.quantum)
-    why_not, arcs = _reason_not_simulated(system, peers), _arc_runs(run)
+    why_not, arcs = reason_not_simulated(system, peers), _arc_runs(run)
     received = [
         [arc for arc in arcs if arc.link == link.name and arc.came.distribution] for link in system.links
     ]
@@ -160,7 +161,7 @@ def _duration(peers: tuple[PeerRun, ...]) -> Fraction:
     return Fraction(max(min(ends, default=0.0), 1e-3)).limit_denominator(10**6)
 
 
-def _reason_not_simulated(system: Model, peers: tuple[PeerRun, ...]) -> str:
+def reason_not_simulated(system: Model, peers: tuple[PeerRun, ...]) -> str:
     """Return the reason why the run cannot be simulated, "" if it can."""
     if len(peers) < system.peers:
         return f"only {len(peers)} of {system.peers} peers recorded the run"
@@ -172,7 +173,7 @@ def _reason_not_simulated(system: Model, peers: tuple[PeerRun, ...]) -> str:
     return f"{', '.join(late)} joined later or again, in a different state" if late else ""
 
 
-class _DeliveredRun:
+class DeliveredRun:
     """The packets in effect at the ticks of a run, frame by frame (see `packet_schedule`)."""
 
     def __init__(self, run: RealtimeRun, population: Population) -> None:
@@ -202,7 +203,7 @@ class _DeliveredRun:
 
 def _differences(run: RealtimeRun, simulation: Simulation) -> dict[str, tuple[float, float]]:
     """Return the largest differences between recorded and simulated signals, by unit."""
-    player = InterpretedEngine(simulation.population, lambda _: _DeliveredRun(run, simulation.population))
+    player = InterpretedEngine(simulation.population, lambda _: DeliveredRun(run, simulation.population))
     simulated_rows = np.concatenate([block.values for block in blocks(simulation, player=player)])
     simulated = {
         signal.name: (signal.unit, simulated_rows[:, column])
