@@ -1,7 +1,7 @@
 """Tables in CSV files: columns with their units in the headings.
 
-Takes: a path. Gives: `read_table`, a `Table` in SI of `CsvColumn`s; `open_table`, `parse_headings`, `read_bytes`,
-for files whose cells are not all numbers; `NamedFiles`.
+Takes: a path. Gives: `read_table`, a `Table` in SI of `CsvColumn`s; `open_table`, `parse_headings`,
+`read_bytes`, for files whose cells are not all numbers; `NamedFiles`.
 Guarantees: every cell is a finite number, or an error names its file, line and column. The text of a file
 that is not a table is never printed, as it may be private. A number takes eight bytes.
 Does not: interpret columns.
