@@ -39,6 +39,9 @@ from .api import (
     export as export,
 )
 from .api import (
+    fit as fit,
+)
+from .api import (
     fit_link as fit_link,
 )
 from .api import (
@@ -110,6 +113,7 @@ from .compiler.errors import ApcError as ApcError
 from .extensions.changing_counts.joins_and_leaves import ChangingCounts as ChangingCounts
 from .extensions.event_order.coincident_events import EventOrder as EventOrder
 from .extensions.paper_method.lifted_matrices import PaperMethod as PaperMethod
+from .extensions.parameter_fit.parameter_estimation import ParameterFit as ParameterFit
 from .extensions.pareto_front.trade_off import Design as Design
 from .extensions.pareto_front.trade_off import ParetoFront as ParetoFront
 from .extensions.switching.arbitrary_switching import ArbitrarySwitching as ArbitrarySwitching

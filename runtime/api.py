@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from apc.extensions.changing_counts.joins_and_leaves import ChangingCounts
     from apc.extensions.event_order.coincident_events import EventOrder
     from apc.extensions.paper_method.lifted_matrices import PaperMethod
+    from apc.extensions.parameter_fit.parameter_estimation import ParameterFit
     from apc.extensions.pareto_front.trade_off import ParetoFront
     from apc.extensions.switching.arbitrary_switching import ArbitrarySwitching
     from apc.extensions.switching.limit_cycle import LimitCycle
@@ -502,6 +503,51 @@ def fit_link(recording: str | Path, *, interval: str | None = None) -> LinkFit:
         None if interval is None else option_value("interval=", interval, subject="time", unit="s")
     )
     return link_fit.fit_recording(recording, None if sending_interval is None else float(sending_interval))
+
+
+@checked
+def fit(
+    model: TopologySource,
+    recording: str | Path,
+    *,
+    free: Mapping[str, str | Sequence[str | float]],
+    params: Values | None = None,
+    signals: Sequence[str] = (),
+) -> ParameterFit:
+    """Return parameters of a model fitted to recorded force and motion by least squares.
+
+    Parameters
+    ----------
+    model
+        As for `analyze`.
+    recording
+        A table (.csv, .parquet, .mat) with a column `time [s]`, or the folder of `apc run`. Its columns are
+        signals of `simulate`, such as `device.x [m]`, and forces, such as `hand [N]`.
+    free
+        The ranges of the free parameters: {"device.mass": "0.05 kg:1 kg"}, or the two ends, as quantities or
+        numbers in SI units.
+    params
+        As for `analyze`; the values of the free parameters are the start of the search.
+    signals
+        Patterns of the measured signals to compare; by default all of the recording.
+
+    Returns
+    -------
+    ParameterFit
+        `.parameters` with estimates, standard errors and 95 % intervals, `.correlation`, and `.residuals`
+        with a test of whiteness; `.params` for `set_parameters`; `.plot()` draws the residuals.
+
+    Raises
+    ------
+    ApcError
+        The input is invalid, or the recording does not determine a parameter.
+    """
+    system, extension = _model(model, params), require_extension("parameter_fit")
+    texts = [f"{name}={_range(system, name, value)}" for name, value in free.items()]
+    result: ParameterFit = extension.fit(
+        system, Path(recording), extension.read_free(system, texts), signals=signals
+    )
+    return result
 
 
 @checked

@@ -13,6 +13,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
         "critical": ["critical_command"],
         "explore": ["explore_command"],
         "export": ["export_command"],
+        "fit": ["fit_command"],
         "transparency": ["transparency_command"],
         "library": ["library_command", "new_command"],
         "network": ["network_command"],

@@ -22,7 +22,7 @@ SECTIONS = {
     "Start": ("new", "library", "check", "compile", "show", "schema"),
     "Analyze": ("analyze", "critical", "region", "sweep", "transparency", "compare"),
     "Design": ("tune", "explore"),
-    "Simulate": ("simulate", "run"),
+    "Simulate": ("simulate", "run", "fit"),
     "Network": ("network",),
     "Export": ("export", "report", "bench"),
 }

@@ -92,6 +92,13 @@ EXTENSIONS = {
             ),
         ),
         Extension(
+            "parameter_fit",
+            "parameters estimated from recorded force and motion",
+            "apc fit",
+            ("parameter_estimation:fit", "parameter_estimation:read_free"),
+            "parameter_fit_output",
+        ),
+        Extension(
             "pareto_front",
             "the Pareto front of two objectives",
             "apc tune --tradeoff",

@@ -1,0 +1,1 @@
+"""Parameters of a topology estimated from recorded force and motion."""

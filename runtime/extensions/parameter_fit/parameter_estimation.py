@@ -1,0 +1,500 @@
+"""Parameters of a topology estimated from a recording by least squares.
+
+Takes: a `Model`, its free parameters with ranges, a recording.
+Gives: `fit`, `read_free`; `ParameterFit`, `Estimate`, `SignalResiduals`.
+Guarantees: residuals are those of the exact simulation at the recorded instants, and their derivatives are
+exact. Parameters that the recording does not determine are refused by name.
+Does not: estimate times, counts or the network.
+
+    min_θ Σ_j Σ_i ((y_j(t_i) − y_j(t_i; θ)) / σ_j)²        Cov θ = s² (Jᵀ J)⁻¹
+
+with the noise σ_j of each signal estimated from its own residuals, in turn with θ (Bates and Watts, Nonlinear
+Regression Analysis, 1988, chapters 2 and 4). Standard errors are those of the linear approximation at the
+estimate, intervals those of Student's distribution.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, ClassVar, Unpack
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.compiler.compiled import Model
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
+from apc.compiler.wording import with_unit
+from apc.extensions.parameter_fit.measured_columns import read_recording
+from apc.extensions.parameter_fit.recorded_signals import RecordedSignals, recorded_signals, signals_of_run
+from apc.extensions.parameter_fit.sensitivity_model import name_of, with_sensitivities, with_values
+from apc.network.nominal_criterion import chance, unreliable
+from apc.parameter_values.parameter_names import Range, find, overlap, proposed_range, value_now
+from apc.realtime.run_comparison import DeliveredRun
+from apc.realtime.run_folder import read_run
+from apc.result import PlotStyle, Result
+from apc.simulation.interpreted_engine import InterpretedEngine
+from apc.simulation.output_blocks import blocks, instants_of
+from apc.simulation.settings import Settings
+from apc.simulation.simulation import check_length, prepare
+from apc.studies.parameter_ranges import parse_range
+from apc.studies.representative_delays import is_delay
+from apc.support.threads import load_pool
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Flags = NDArray[np.bool_]
+
+FREE = SourceLocation("--free")
+CONFIDENCE = 0.95
+# Relative singular value of the Jacobian, its columns of length 1, below which a combination of parameters is
+# undetermined: its standard error is 1e8 times that of one parameter. Derivatives are exact to about 1e-12.
+SINGULAR = 1e-8
+NAMED = 0.1  # share of a singular vector, relative to its largest, above which a parameter belongs to it
+NO_EFFECT = (
+    1e-12  # change of a signal over the range of a parameter, relative to the signal, that is rounding
+)
+EXACT = 1e-9  # residuals, relative to the signal, that count as rounding: their correlation has no meaning
+TOLERANCE = (
+    1e-14  # of SciPy's least_squares, for changes of the sum of squares, of parameters, and the gradient
+)
+MOST_EVALUATIONS = 200
+MOST_ROUNDS, SETTLED = 50, 1e-6  # of the noise of each signal: rounds, and the relative change at the end
+AT_END = 1e-6  # share of the range within which an estimate counts as at its end
+LAGS = (
+    10  # of the whiteness test, at most a fifth of the rows (Hyndman and Athanasopoulos, FPP3, section 5.4)
+)
+WHITE = 0.01  # the probability below which white residuals are rejected
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """A parameter: its estimate, standard error and 95 % interval, in SI; `low` and `high` are its range.
+
+    `at_end` states that the estimate is at an end of its range, so that its interval has no meaning.
+    """
+
+    name: str
+    value: float
+    unit: str
+    standard_error: float
+    interval: tuple[float, float]
+    low: float
+    high: float
+    at_end: bool
+
+
+@dataclass(frozen=True, slots=True)
+class SignalResiduals:
+    """The residuals of a signal: their rms in SI, and the Ljung-Box test of their whiteness.
+
+    `probability` is that of a larger statistic over `lags` lags for white residuals, NaN if the residuals are
+    rounding errors. `used` states whether the signal depends on a free parameter.
+    """
+
+    signal: str
+    unit: str
+    rms: float
+    lags: int
+    probability: float
+    used: bool
+
+    @property
+    def white(self) -> bool:
+        """Whether the residuals are consistent with white noise."""
+        return not self.probability < WHITE
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ParameterFit(Result):
+    """The parameters of a topology estimated from a recording.
+
+    `correlation` (k, k) is that of the estimates. `samples` of the `rows` of the recording, at ticks of the
+    fastest clock, are compared, over `duration` seconds; `start` is the recorded time of the first row.
+    `forces` are the columns that act as forces. `time` (samples,) in seconds, `measured` and `fitted`
+    (samples, signals) are in SI.
+    """
+
+    shown_by: ClassVar[str] = "apc.extensions.parameter_fit.parameter_fit_output:parameter_fit"
+
+    topology: str
+    recording: str
+    parameters: tuple[Estimate, ...]
+    correlation: tuple[tuple[float, ...], ...]
+    residuals: tuple[SignalResiduals, ...]
+    rows: int
+    samples: int
+    duration: float
+    start: float
+    forces: tuple[str, ...]
+    evaluations: int
+    time: Floats = field(repr=False)
+    measured: Floats = field(repr=False)
+    fitted: Floats = field(repr=False)
+
+    @property
+    def params(self) -> dict[str, float]:
+        """The estimates by name, as the argument `params` of other functions."""
+        return {estimate.name: estimate.value for estimate in self.parameters}
+
+    def to_dataframe(self) -> Any:
+        """Return a pandas DataFrame with one row for each parameter, in SI."""
+        return self._shown("table")
+
+    def plot(self, ax: Any = None, **style: Unpack[PlotStyle]) -> Any:
+        """Return a Figure with the residuals of each signal, or draw those of a single signal into `ax`."""
+        return self._plotted(ax, style=style)
+
+
+def read_free(system: Model, texts: Sequence[str]) -> tuple[Range, ...]:
+    """Return the free parameters of texts `NAME=LOW:HIGH`.
+
+    Raises
+    ------
+    ApcError
+        E714 there is none, a parameter is given twice or is a delay, or its value is outside its range; and
+        the errors of `parse_range`.
+    """
+    if not texts:
+        message, fix = "no free parameter", f'--free "{proposed_range(system)}"'
+        raise ApcError(Diagnostic("E714", FREE, message, fix=fix))
+    free: list[Range] = []
+    for text in texts:
+        name = text.partition("=")[0].strip()
+        if name and is_delay(system, find(system, name, FREE)):
+            message = f"{name} is a delay: the order of events changes with it"
+            raise ApcError(Diagnostic("E714", FREE, message, advice="fit it to packets with apc network"))
+        item = parse_range(system, text, FREE)
+        label, value = item.free.label, value_now(system, item.free)
+        if any(overlap(system, item.free, other.free) for other in free):
+            raise ApcError(Diagnostic("E714", FREE, f"{label} has two ranges"))
+        if not item.low <= value <= item.high:
+            low, high, now, middle = (
+                with_unit(f"{float(number):.6g}", item.unit).removesuffix(" 1")
+                for number in (item.low, item.high, value, (item.low + item.high) / 2)
+            )
+            message, fix = f"start value of {label}", f'--set "{label}={middle}"'
+            raise ApcError(Diagnostic("E714", FREE, message, f"{low} to {high}", now, fix))
+        free.append(item)
+    return tuple(free)
+
+
+def fit(
+    system: Model, recording: Path, free: Sequence[Range], *, signals: Sequence[str] = ()
+) -> ParameterFit:
+    """Return the parameters of a model fitted to a recording.
+
+    Parameters
+    ----------
+    system
+        The model; its parameter values are the start of the search.
+    recording
+        A table of force and motion (see `measured_columns`), or the folder of a run.
+    free
+        The free parameters.
+    signals
+        Patterns of the measured signals to compare; by default all of the recording.
+
+    Raises
+    ------
+    ApcError
+        E711 to E713 the recording or the model is unsuitable, E715 the recording does not determine a
+        parameter, E716 the search fails; and those of `simulate`.
+    """
+    if recording.is_dir():
+        recorded = signals_of_run(system, read_run(recording), signals)
+    else:
+        for link, law in unreliable(system):
+            if law.trace is None:
+                message = f"{chance(link, law)}: a table does not contain the packets that arrived"
+                location, fix = SourceLocation(system.origin.topology), f"apc run {system.origin.topology}"
+                raise ApcError(Diagnostic("E713", location, message, fix=fix))
+        recorded = recorded_signals(system, read_recording(recording), signals)
+    return _solve(_problem_of(system, recorded, str(recording), tuple(free)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Problem:
+    """A least-squares problem over shares of the ranges, from 0 to 1.
+
+    `system` has the sensitivities; `low` and `width` (k,) are those of the ranges. `rows` are the simulated
+    rows at recorded instants, and `measured` (samples, signals) the values there. `scale` (signals,) is the
+    spread of each signal.
+    """
+
+    topology: str
+    file: str
+    recorded: RecordedSignals
+    free: tuple[Range, ...]
+    system: Model
+    low: Floats
+    width: Floats
+    start: Floats
+    rows: Integers
+    time: Floats
+    measured: Floats
+    scale: Floats
+
+    def values(self, shares: Floats) -> Floats:
+        """Return the parameters (k,) in SI at shares of their ranges."""
+        return np.clip(self.low + self.width * shares, self.low, self.low + self.width)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Outputs:
+    """Simulated signals (samples, signals) and their derivatives over shares (samples, signals, k)."""
+
+    values: Floats
+    slopes: Floats
+
+
+def _problem_of(system: Model, recorded: RecordedSignals, file: str, free: tuple[Range, ...]) -> _Problem:
+    """Return the least-squares problem of a recording. Raises ApcError E712 for a short recording."""
+    check_length(recorded.system, recorded.duration)
+    low = np.array([float(item.low) for item in free])
+    width = np.array([float(item.high) for item in free]) - low
+    now = np.array([value_now(system, item.free) for item in free])
+    simulation = prepare(recorded.system, Settings(recorded.duration, jit=False))
+    frame = simulation.frame * simulation.quantum
+    if recorded.duration < frame:
+        expected = f"at least one frame, {1e3 * float(frame):.6g} ms"
+        raise _short(file, "duration", expected, f"{1e3 * float(recorded.duration):.6g} ms")
+    last = int(recorded.duration / simulation.quantum)
+    instants, is_row = instants_of(simulation, 0, last // simulation.frame + 1, last)
+    ticks = np.asarray(instants[is_row] * float(simulation.quantum))
+    rows, indices = _common(ticks, recorded.times)
+    if len(rows) * len(recorded.signals) <= len(free):
+        expected = f"more samples at ticks of the clocks than the {len(free)} free parameters"
+        raise _short(file, "samples", expected, str(len(rows) * len(recorded.signals)))
+    measured = recorded.values[indices]
+    spread = np.maximum(measured.std(axis=0), EXACT * np.abs(measured).max(axis=0))
+    return _Problem(
+        topology=system.name,
+        file=file,
+        recorded=recorded,
+        free=free,
+        system=with_sensitivities(recorded.system, free),
+        low=low,
+        width=width,
+        start=np.clip((now - low) / width, 0.0, 1.0),
+        rows=rows,
+        time=recorded.times[indices],
+        measured=measured,
+        scale=np.where(spread > 0, spread, 1.0),
+    )
+
+
+def _short(file: str, message: str, expected: str, got: str) -> ApcError:
+    """Return the error E712 for a recording that is too short."""
+    advice = "use a longer recording, or rows at the ticks of the clocks"
+    return ApcError(Diagnostic("E712", SourceLocation(file), message, expected, got, advice=advice))
+
+
+def _common(ticks: Floats, times: Floats) -> tuple[Integers, Integers]:
+    """Return the indices of equal instants among ticks and recorded times."""
+    tolerance = AT_END * float(np.diff(times).min())
+    nearest = np.minimum(np.searchsorted(times, ticks - tolerance), len(times) - 1)
+    rows = np.flatnonzero(np.abs(times[nearest] - ticks) <= tolerance)
+    return rows, nearest[rows]
+
+
+def _simulate(problem: _Problem, shares: Floats) -> _Outputs | None:
+    """Return the signals and their derivatives at shares of the ranges, None for a diverging motion."""
+    count, recorded = len(problem.free), problem.recorded
+    system = with_values(problem.system, problem.free, problem.values(shares))
+    names = [
+        f"{signal.group}[{signal.peer}].{name_of(k, signal.local) if k else signal.local}"
+        for signal in recorded.signals
+        for k in range(count + 1)
+    ]
+    simulation = prepare(system, Settings(recorded.duration, jit=False), signals=names)
+    run, player = recorded.run, None
+    if run is not None:
+        population = simulation.population
+        player = InterpretedEngine(population, lambda _: DeliveredRun(run, population))
+    rows = np.concatenate([block.values for block in blocks(simulation, player=player)])
+    if len(rows) <= problem.rows[-1]:
+        return None
+    column = {signal.name: index for index, signal in enumerate(simulation.signals)}
+    order = [column[name] for name in names]
+    outputs = rows[problem.rows][:, order].reshape(len(problem.rows), -1, count + 1)
+    return _Outputs(outputs[..., 0], outputs[..., 1:])
+
+
+def _solve(problem: _Problem) -> ParameterFit:
+    """Return the solution of a least-squares problem.
+
+    Raises
+    ------
+    ApcError
+        E715 the recording does not determine a parameter, E716 the motion diverges or the search fails.
+    """
+    least_squares = load_pool("scipy.optimize").least_squares
+    known: dict[bytes, _Outputs | None] = {}
+    evaluations = 0
+
+    def outputs(shares: Floats) -> _Outputs | None:
+        """Return the outputs at shares; the last ones are kept."""
+        nonlocal evaluations
+        key = shares.tobytes()
+        if key not in known:
+            known.clear()
+            known[key] = _simulate(problem, shares)
+            evaluations += 1
+        return known[key]
+
+    def residuals(shares: Floats, noise: Floats) -> Floats:
+        """Return the residuals relative to the noise; infinite for a diverging motion."""
+        found = outputs(shares)
+        if found is None:
+            return np.full(problem.measured.size, np.inf)
+        return ((found.values - problem.measured) / noise).ravel()
+
+    def slopes(shares: Floats, noise: Floats) -> Floats:
+        """Return the Jacobian of `residuals`."""
+        found = outputs(shares)
+        assert found is not None  # SciPy accepts no diverging motion
+        return (found.slopes / noise[:, None]).reshape(-1, len(problem.free))
+
+    shares, noise = problem.start, problem.scale
+    if outputs(shares) is None:
+        location = SourceLocation(problem.recorded.system.origin.topology)
+        message = "the motion diverges at the start values of the free parameters"
+        raise ApcError(Diagnostic("E716", location, message, advice="start from values of a stable topology"))
+    tolerances = dict.fromkeys(("ftol", "xtol", "gtol"), TOLERANCE)
+    for _ in range(MOST_ROUNDS):
+        solution = least_squares(
+            residuals,
+            shares,
+            slopes,
+            bounds=(0.0, 1.0),
+            x_scale="jac",
+            max_nfev=MOST_EVALUATIONS,
+            kwargs={"noise": noise},
+            **tolerances,
+        )
+        shares = solution.x
+        found = outputs(shares)
+        assert found is not None
+        rms = np.sqrt(np.mean((found.values - problem.measured) ** 2, axis=0))
+        last, noise = noise, np.maximum(rms, EXACT * problem.scale)
+        if solution.success and (len(noise) == 1 or np.abs(noise / last - 1).max() < SETTLED):
+            return _result(problem, shares, found, evaluations)
+        if not solution.success:
+            break
+    message = f"no minimum within {evaluations} simulations"
+    advice = "use narrower ranges, or fewer free parameters"
+    raise ApcError(Diagnostic("E716", SourceLocation(problem.file), message, advice=advice))
+
+
+def _result(problem: _Problem, shares: Floats, found: _Outputs, evaluations: int) -> ParameterFit:
+    """Return the estimates with their statistics, from the outputs at the solution."""
+    from scipy.stats import t as student
+
+    difference = problem.measured - found.values
+    rms = np.sqrt(np.mean(difference**2, axis=0))
+    effects = np.abs(found.slopes).max(axis=0) / problem.scale[:, None]
+    used = effects.max(axis=1) > NO_EFFECT
+    noise = np.maximum(rms, EXACT * problem.scale)
+    jacobian = (found.slopes / noise[:, None])[:, used].reshape(-1, len(shares))
+    _check_determined(problem, jacobian, effects.max(axis=0) > NO_EFFECT)
+    freedom = len(jacobian) - len(shares)
+    variance = float(np.sum((difference / noise)[:, used] ** 2)) / freedom
+    lengths = np.linalg.norm(jacobian, axis=0)
+    _, singular, right = np.linalg.svd(jacobian / lengths, full_matrices=False)
+    covariance = (right.T / singular**2) @ right  # of the parameters times `lengths`, for unit variance
+    deviation = np.sqrt(np.diag(covariance))
+    errors = np.sqrt(variance) * deviation / lengths * problem.width
+    margin = float(student.ppf((1 + CONFIDENCE) / 2, freedom)) * errors
+    values = problem.values(shares)
+    return ParameterFit(
+        topology=problem.topology,
+        recording=problem.file,
+        parameters=tuple(
+            Estimate(
+                name=item.free.label,
+                value=float(value),
+                unit=item.unit,
+                standard_error=float(error),
+                interval=(float(value - half), float(value + half)),
+                low=float(item.low),
+                high=float(item.high),
+                at_end=not AT_END < share < 1 - AT_END,
+            )
+            for item, value, error, half, share in zip(
+                problem.free, values, errors, margin, shares, strict=True
+            )
+        ),
+        correlation=tuple(map(tuple, (covariance / np.outer(deviation, deviation)).tolist())),
+        residuals=tuple(
+            SignalResiduals(
+                signal.name,
+                signal.unit,
+                float(rms[j]),
+                *_ljung_box(difference[:, j], exact=bool(rms[j] <= EXACT * problem.scale[j])),
+                used=bool(used[j]),
+            )
+            for j, signal in enumerate(problem.recorded.signals)
+        ),
+        rows=len(problem.recorded.times),
+        samples=len(problem.rows),
+        duration=float(problem.recorded.duration),
+        start=problem.recorded.start,
+        forces=problem.recorded.forces,
+        evaluations=evaluations,
+        time=problem.time,
+        measured=problem.measured,
+        fitted=found.values,
+    )
+
+
+def _check_determined(problem: _Problem, jacobian: Floats, has_effect: Flags) -> None:
+    """Raise ApcError E715 with the parameters that the recording does not determine.
+
+    The Fisher information JᵀJ is singular where a singular value of J is 0: a parameter without effect, or a
+    combination of parameters without effect.
+
+    Parameters
+    ----------
+    problem
+        The problem.
+    jacobian
+        The derivatives of the residuals (residuals, k).
+    has_effect
+        Whether each parameter has an effect on a signal (k,).
+    """
+    names = [item.free.label for item in problem.free]
+    idle = [name for name, effect in zip(names, has_effect, strict=True) if not effect]
+    if idle:
+        message = f"{', '.join(idle)}: no effect on the measured signals"
+        advice = "omit its --free, or record a motion on which it acts"
+        raise ApcError(Diagnostic("E715", SourceLocation(problem.file), message, advice=advice))
+    scaled = jacobian / np.linalg.norm(jacobian, axis=0)
+    _, singular, right = np.linalg.svd(scaled, full_matrices=False)
+    if singular[-1] > SINGULAR * singular[0]:
+        return
+    weights = np.abs(right[singular <= SINGULAR * singular[0]]).max(axis=0)
+    among = [name for name, weight in zip(names, weights, strict=True) if weight > NAMED * weights.max()]
+    message = f"{', '.join(among)}: only a combination of these has an effect on the measured signals"
+    advice = f"fix one of them: omit the --free of {among[-1]}, or record another signal"
+    raise ApcError(Diagnostic("E715", SourceLocation(problem.file), message, advice=advice))
+
+
+def _ljung_box(residuals: Floats, *, exact: bool) -> tuple[int, float]:
+    """Return the lags and the probability of a Ljung-Box test (Ljung and Box, Biometrika 65, 1978, 297).
+
+    Q = n (n + 2) Σ_h r_h² / (n − h) is distributed as χ² with as many degrees of freedom as lags, for white
+    residuals with autocorrelations r_h.
+    """
+    from scipy.stats import chi2
+
+    n = len(residuals)
+    lags = min(LAGS, n // 5)
+    centered = residuals - residuals.mean()
+    power = float(centered @ centered)
+    if exact or not lags or not power:
+        return lags, float("nan")
+    r = np.array([centered[h:] @ centered[: n - h] for h in range(1, lags + 1)]) / power
+    statistic = n * (n + 2) * float(np.sum(r**2 / (n - np.arange(1, lags + 1))))
+    return lags, float(chi2.sf(statistic, lags))
