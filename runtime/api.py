@@ -513,6 +513,7 @@ def fit(
     free: Mapping[str, str | Sequence[str | float]],
     params: Values | None = None,
     signals: Sequence[str] = (),
+    method: str | None = None,
 ) -> ParameterFit:
     """Return parameters of a model fitted to recorded force and motion by least squares.
 
@@ -530,6 +531,8 @@ def fit(
         As for `analyze`; the values of the free parameters are the start of the search.
     signals
         Patterns of the measured signals to compare; by default all of the recording.
+    method
+        The integration method, as for `simulate`.
 
     Returns
     -------
@@ -542,10 +545,13 @@ def fit(
     ApcError
         The input is invalid, or the recording does not determine a parameter.
     """
+    from apc.simulation.settings import DEFAULT, parse_method
+
     system, extension = _model(model, params), require_extension("parameter_fit")
+    chosen = DEFAULT if method is None else parse_method(method)
     texts = [f"{name}={_range(system, name, value)}" for name, value in free.items()]
     result: ParameterFit = extension.fit(
-        system, Path(recording), extension.read_free(system, texts), signals=signals
+        system, Path(recording), extension.read_free(system, texts), signals=signals, method=chosen
     )
     return result
 

@@ -25,6 +25,11 @@ def fit_command(
     signals: tuple[str, ...] = option(
         "Measured signals to compare (repeatable).", "PATTERN", show_default="all of RECORDING"
     ),
+    method: str | None = option(
+        "exact, rk4:STEP, semi-implicit:STEP or cvodes:RTOL.",
+        "METHOD",
+        show_default="exact; cvodes if nonlinear",
+    ),
     write: Path | None = option("Write the topology with the estimates (.yaml)."),
     plot: Path | None = picture_option("Plot the residuals (.png, .svg, .pdf)."),
     as_json: bool,
@@ -43,6 +48,7 @@ def fit_command(
     """
     from apc.inputs.open_model import check_outputs, open_topology
     from apc.output.pictures import write_picture
+    from apc.simulation.settings import DEFAULT, parse_method
     from apc.support.extension_table import require_extension
 
     extension = require_extension("parameter_fit")
@@ -51,8 +57,9 @@ def fit_command(
     check_outputs(Path(recording), (), outputs)
     system = open_topology(file, settings, outputs, varied=free, notify=note_aside)
     ranges = extension.read_free(system, free)
+    chosen = parse_method(method) if method is not None else DEFAULT
     with at_work("fitting"):
-        fit = extension.fit(system, Path(recording), ranges, signals=signals)
+        fit = extension.fit(system, Path(recording), ranges, signals=signals, method=chosen)
     refused: ApcError | None = None
     if write is not None:
         try:

@@ -36,7 +36,7 @@ from apc.realtime.run_folder import read_run
 from apc.result import PlotStyle, Result
 from apc.simulation.interpreted_engine import InterpretedEngine
 from apc.simulation.output_blocks import blocks, instants_of
-from apc.simulation.settings import Settings
+from apc.simulation.settings import DEFAULT, Method, Settings
 from apc.simulation.simulation import check_length, prepare
 from apc.studies.parameter_ranges import parse_range
 from apc.studies.representative_delays import is_delay
@@ -181,7 +181,12 @@ def read_free(system: Model, texts: Sequence[str]) -> tuple[Range, ...]:
 
 
 def fit(
-    system: Model, recording: Path, free: Sequence[Range], *, signals: Sequence[str] = ()
+    system: Model,
+    recording: Path,
+    free: Sequence[Range],
+    *,
+    signals: Sequence[str] = (),
+    method: Method = DEFAULT,
 ) -> ParameterFit:
     """Return the parameters of a model fitted to a recording.
 
@@ -195,6 +200,8 @@ def fit(
         The free parameters.
     signals
         Patterns of the measured signals to compare; by default all of the recording.
+    method
+        The integration method between events, as for `simulate`.
 
     Raises
     ------
@@ -211,22 +218,23 @@ def fit(
                 location, fix = SourceLocation(system.origin.topology), f"apc run {system.origin.topology}"
                 raise ApcError(Diagnostic("E713", location, message, fix=fix))
         recorded = recorded_signals(system, read_recording(recording), signals)
-    return _solve(_problem_of(system, recorded, str(recording), tuple(free)))
+    return _solve(_problem_of(system, recorded, str(recording), tuple(free), method))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Problem:
     """A least-squares problem over shares of the ranges, from 0 to 1.
 
-    `system` has the sensitivities; `low` and `width` (k,) are those of the ranges. `rows` are the simulated
-    rows at recorded instants, and `measured` (samples, signals) the values there. `scale` (signals,) is the
-    spread of each signal.
+    `method` is the integration method. `system` has the sensitivities; `low` and `width` (k,) are those of
+    the ranges. `rows` are the simulated rows at recorded instants, and `measured` (samples, signals) the
+    values there. `scale` (signals,) is the spread of each signal.
     """
 
     topology: str
     file: str
     recorded: RecordedSignals
     free: tuple[Range, ...]
+    method: Method
     system: Model
     low: Floats
     width: Floats
@@ -249,13 +257,15 @@ class _Outputs:
     slopes: Floats
 
 
-def _problem_of(system: Model, recorded: RecordedSignals, file: str, free: tuple[Range, ...]) -> _Problem:
+def _problem_of(
+    system: Model, recorded: RecordedSignals, file: str, free: tuple[Range, ...], method: Method
+) -> _Problem:
     """Return the least-squares problem of a recording. Raises ApcError E712 for a short recording."""
     check_length(recorded.system, recorded.duration)
     low = np.array([float(item.low) for item in free])
     width = np.array([float(item.high) for item in free]) - low
     now = np.array([value_now(system, item.free) for item in free])
-    simulation = prepare(recorded.system, Settings(recorded.duration, jit=False))
+    simulation = prepare(recorded.system, Settings(recorded.duration, method, jit=False))
     frame = simulation.frame * simulation.quantum
     if recorded.duration < frame:
         expected = f"at least one frame, {1e3 * float(frame):.6g} ms"
@@ -274,6 +284,7 @@ def _problem_of(system: Model, recorded: RecordedSignals, file: str, free: tuple
         file=file,
         recorded=recorded,
         free=free,
+        method=method,
         system=with_sensitivities(recorded.system, free),
         low=low,
         width=width,
@@ -308,7 +319,7 @@ def _simulate(problem: _Problem, shares: Floats) -> _Outputs | None:
         for signal in recorded.signals
         for k in range(count + 1)
     ]
-    simulation = prepare(system, Settings(recorded.duration, jit=False), signals=names)
+    simulation = prepare(system, Settings(recorded.duration, problem.method, jit=False), signals=names)
     run, player = recorded.run, None
     if run is not None:
         population = simulation.population

@@ -186,6 +186,14 @@ class _Extension:
                 for send in original.sends
             ),
             rounded=original.rounded,
+            limits=tuple(
+                replace(
+                    limit, name=name_of(k, limit.name) if k else limit.name, value=self._row(limit.value, k)
+                )
+                for k in (0, *self.orders)
+                for limit in original.limits
+                if limit.value is not None
+            ),
         )
 
     def _all(self, names: Sequence[str]) -> tuple[str, ...]:
@@ -219,10 +227,14 @@ class _Extension:
         if receive.edge is None:
             channel = receive.channel + k * self.channels[receive.link]
             return replace(receive, name=name_of(k, receive.name) if k else receive.name, channel=channel)
-        edge = self._function(receive.edge, channels=self.channels[receive.link])
-        symbols = _symbols(edge)
-        edge = _like(edge, symbols, edge(*symbols)[k])
+        edge = self._row(receive.edge, k, self.channels[receive.link])
         return replace(receive, name=name_of(k, receive.name) if k else receive.name, edge=edge)
+
+    def _row(self, function: Any, k: int, channels: int | None = None) -> Any:
+        """Return a function of one value (k = 0), or its derivative over free parameter k."""
+        extended = self._function(function, channels=channels)
+        symbols = _symbols(extended)
+        return _like(extended, symbols, extended(*symbols)[k])
 
     def _function(
         self, function: Any, *, received: Sequence[int] | None = None, channels: int | None = None
