@@ -20,6 +20,7 @@ from tests.topologies import ROOT
 FOLDERS = ROOT / "runtime" / "extensions"
 TOPOLOGIES = ROOT / "models" / "topologies"
 AVERAGE = TOPOLOGIES / "three-users-average.yaml"
+PUSH = f"{ROOT / 'docs/howto/push.csv'} {ROOT / 'docs/howto/one-device.yaml'}"
 COLGATE = "colgate:K=contact.stiffness,B=contact.damping,b=0,T=haptic.period"
 GAIN = '--free "coordination.stiffness=10 N/m:5000 N/m"'
 
@@ -30,6 +31,7 @@ QUESTIONS = {
     "loss_models": f"simulate {TOPOLOGIES / 'lossy-average.yaml'} --trace-of worst --duration '0.1 s'",
     "paper_method": f"analyze {AVERAGE} --method paper",
     "parameter_boxes": f"analyze {AVERAGE} --box contact.stiffness=±1%",
+    "parameter_fit": f"fit {PUSH} --free 'device.mass=0.05 kg:1 kg'",
     "pareto_front": f"tune {AVERAGE} {GAIN} --maximize coordination.stiffness --tradeoff 'impedance at 5 Hz'",
     "switching": f"analyze {TOPOLOGIES / 'finger.yaml'} --limit-cycle",
     "system_norms": f"tune {AVERAGE} {GAIN} --minimize coordination_error_h2",

@@ -52,13 +52,9 @@ CONFIDENCE = 0.95
 # undetermined: its standard error is 1e8 times that of one parameter. Derivatives are exact to about 1e-12.
 SINGULAR = 1e-8
 NAMED = 0.1  # share of a singular vector, relative to its largest, above which a parameter belongs to it
-NO_EFFECT = (
-    1e-12  # change of a signal over the range of a parameter, relative to the signal, that is rounding
-)
+NO_EFFECT = 1e-12  # relative change of a signal over the range of a parameter that counts as rounding
 EXACT = 1e-9  # residuals, relative to the signal, that count as rounding: their correlation has no meaning
-TOLERANCE = (
-    1e-14  # of SciPy's least_squares, for changes of the sum of squares, of parameters, and the gradient
-)
+TOLERANCE = 1e-12  # of least_squares: changes of the sum of squares and of parameters, and the gradient
 MOST_EVALUATIONS = 200
 MOST_ROUNDS, SETTLED = 50, 1e-6  # of the noise of each signal: rounds, and the relative change at the end
 AT_END = 1e-6  # share of the range within which an estimate counts as at its end

@@ -7,6 +7,7 @@ Does not: compute.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -42,7 +43,7 @@ def parameter_fit_text(fit: ParameterFit) -> Lines:
     tests = [("signal", "rms", "Ljung-Box test")]
     for signal in fit.residuals:
         probability = f"p = {signal.probability:.3g}, {counted(signal.lags, 'lag')}"
-        if signal.probability != signal.probability:
+        if math.isnan(signal.probability):
             probability = "rounding errors"
         tests.append((signal.signal, quantity(signal.rms, signal.unit, 3), probability))
     yield from table(tests)
