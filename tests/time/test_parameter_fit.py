@@ -241,7 +241,7 @@ def test_a_run_is_fitted_with_the_packets_that_arrived(cli: Cli, monkeypatch: py
     assert estimate["value"] == pytest.approx(500.0, rel=1e-8)
     write("other.yaml", replaced(AVERAGE, changes[0], ("haptic: 1 ms", "haptic: 2 ms")))
     ran = cli("fit t.run other.yaml --free 'coordination.stiffness=100 N/m:900 N/m'")
-    assert ran.code == 1 and "E713 the run is of another topology" in ran.err
+    assert ran.code == 1 and "E713 the run can't be repeated: it is of another topology" in ran.err
 
 
 def recorded(tmp_path: Path, rows: int = 300, **changes: Callable[[Matrix], Matrix]) -> Path:
@@ -332,7 +332,7 @@ FREE = {MASS: "0.05 kg:1 kg"}
         (
             "0,1,0\n0.002,1,0\n0.001,1,0\n",
             FREE,
-            "E712 time: expected increasing times, got 0.001 s after",
+            "E712 time: expected equal intervals of 0.5 ms, got 2 ms after row 1",
         ),
         ("0,1,0\n", FREE, "E712 rows: expected two or more, got 1"),
         (f"0,1,0\n{ROW}\n", {}, "E714 no free parameter. Try: --free"),
@@ -363,7 +363,7 @@ def test_an_unsuitable_recording_is_refused_with_one_message(
         ("time [s],hand [N],device.x [N]", "E711 unit of column device.x: expected m, got N", "device.x [m]"),
         ("time [s],hand [m],device.x [m]", "E711 unit of column hand: expected N, got m", "hand [N]"),
         ("time [s],hand [N],hand.force [N]", "E711 column hand.force: expected a signal", ""),
-        ("time [s],hand [N],device [N]", "E711 columns: expected a measured signal", ""),
+        ("time [s],hand [N],device [N]", "E711 measured signals: expected one or more, got only forces", ""),
         ("time [m],hand [N],device.x [m]", "E711 columns: expected a column time [s]", ""),
         (
             "time [s],hand [N],user[1].device.x [m],device.x [m]",

@@ -48,19 +48,14 @@ class MeasuredColumn:
 class MeasuredTable:
     """The columns of a recording, without the time: row i is at i·`interval` seconds.
 
-    `start` is the recorded time of the first row, in seconds.
+    `times` (rows,) are these times; `start` is the recorded time of the first row.
     """
 
     file: str
     columns: tuple[MeasuredColumn, ...]
-    rows: int
+    times: Floats
     interval: Fraction
     start: float
-
-    @property
-    def times(self) -> Floats:
-        """The times of the rows (rows,) in seconds."""
-        return np.arange(self.rows) * self.interval.numerator / self.interval.denominator
 
 
 def read_recording(path: Path) -> MeasuredTable:
@@ -77,23 +72,25 @@ def read_recording(path: Path) -> MeasuredTable:
     ApcError
         E701 to E703 as for a table, E711 unsuitable columns, E712 unsuitable times.
     """
-    suffix = Path(path.stem).suffix.lower() if path.suffix.lower() == PACKED else path.suffix.lower()
-    read = {".csv": _read_csv, ".parquet": _read_parquet, ".mat": _read_mat}.get(suffix)
-    if read is None:
-        expected = ".csv, .parquet, .mat, or the folder of apc run"
-        raise _fault(path, "E711", "suffix of the recording", expected, suffix or "none")
-    columns = read(path)
-    times = [column for column in columns if column.name == TIME and column.unit.dimension == SECOND]
+    suffix = path.with_suffix("").suffix if path.suffix == PACKED else path.suffix
+    try:
+        columns = {".csv": _read_csv, ".parquet": _read_parquet, ".mat": _read_mat}[suffix.lower()](path)
+    except RefusedError as refused:
+        raise ApcError(Diagnostic("E701", SourceLocation(str(path)), f"{path} {refused.words}")) from None
+    except (ValueError, TypeError, LookupError, OSError, NotImplementedError):  # those of the libraries
+        expected = "a table in a .csv, .parquet or .mat file (version 5), or the folder of apc run"
+        raise _fault(path, "E711", "recording", expected, "another file") from None
+    times = [column.numbers for column in columns if column.name == TIME and column.unit.dimension == SECOND]
     if not times:
-        raise _fault(path, "E711", "columns", f"a column {EXAMPLE}", ", ".join(c.name for c in columns[:6]))
+        names = ", ".join(column.name for column in columns[:6])
+        raise _fault(path, "E711", "columns", f"a column {EXAMPLE}", names)
     for column in columns:
-        wrong = np.flatnonzero(~np.isfinite(column.numbers))
-        if len(wrong):
-            got = f"{column.numbers[wrong[0]]:g}"
-            raise _fault(path, "E712", f"{column.name}, row {wrong[0] + 1}", "a finite number", got)
-    interval = _interval(path, times[0].numbers)
-    others = tuple(column for column in columns if column is not times[0])
-    return MeasuredTable(str(path), others, len(times[0].numbers), interval, float(times[0].numbers[0]))
+        for row in np.flatnonzero(~np.isfinite(column.numbers))[:1].tolist():
+            got = f"{column.numbers[row]:g}"
+            raise _fault(path, "E712", f"{column.name}, row {row + 1}", "a finite number", got)
+    interval, others = _interval(path, times[0]), (column for column in columns if column.name != TIME)
+    even = np.arange(len(times[0])) * interval.numerator / interval.denominator
+    return MeasuredTable(str(path), tuple(others), even, interval, float(times[0][0]))
 
 
 def _read_csv(path: Path) -> list[MeasuredColumn]:
@@ -104,34 +101,22 @@ def _read_csv(path: Path) -> list[MeasuredColumn]:
 
 def _read_parquet(path: Path) -> list[MeasuredColumn]:
     """Return the columns of a Parquet file in SI."""
-    parquet = need("pyarrow.parquet", "data")
-    try:
-        table = parquet.read_table(io.BytesIO(_bytes(path)))
-        numbers = [table.column(index).to_numpy() for index in range(table.num_columns)]
-        return _columns(path, table.column_names, numbers)
-    except (ValueError, TypeError, OSError) as error:  # as those of PyArrow
-        raise _unreadable(path, "Parquet") from error
+    table = need("pyarrow.parquet", "data").read_table(io.BytesIO(read_file(path, LARGEST)))
+    return _columns(path, table.column_names, [column.to_numpy() for column in table.columns])
 
 
 def _read_mat(path: Path) -> list[MeasuredColumn]:
     """Return the columns of a MAT file in SI."""
     from scipy.io import loadmat
-    from scipy.io.matlab import MatReadError
 
-    try:
-        variables = loadmat(io.BytesIO(_bytes(path)), variable_names=VARIABLES)
-        time, values, names, units = (variables.get(name) for name in VARIABLES)
-        if time is None or values is None or names is None or units is None:
-            got = ", ".join(sorted(name for name in variables if name in VARIABLES)) or "none"
-            raise _fault(path, "E711", "variables", "time, values (rows, signals), names and units", got)
-        texts = [[str(np.ravel(cell)[0]) for cell in np.ravel(cells)] for cells in (names, units)]
-        if len(values) != time.size or {len(item) for item in texts} != {values.shape[1]}:
-            expected = f"{time.size} rows and {len(texts[0])} columns, as in time and names"
-            raise _fault(path, "E711", "values", expected, " by ".join(map(str, values.shape)))
-        headings = [EXAMPLE, *(f"{name} [{unit}]" for name, unit in zip(*texts, strict=True))]
-        return _columns(path, headings, [time.reshape(-1), *values.T])
-    except (MatReadError, ValueError, TypeError, IndexError, NotImplementedError, OSError) as error:
-        raise _unreadable(path, "MAT (version 5)") from error
+    variables = loadmat(io.BytesIO(read_file(path, LARGEST)), variable_names=VARIABLES)
+    time, values, names, units = (variables[name] for name in VARIABLES)
+    if time.size != len(values) or not names.size == units.size == values.shape[1]:
+        expected = f"{time.size} rows and {names.size} columns, as in time, names and units"
+        raise _fault(path, "E711", "values", expected, " by ".join(map(str, values.shape)))
+    pairs = zip(names.ravel(), units.ravel(), strict=True)
+    headings = [EXAMPLE, *(f"{name[0]} [{unit[0]}]" for name, unit in pairs)]
+    return _columns(path, headings, [time.ravel(), *values.T])
 
 
 def _columns(path: Path, headings: list[str], numbers: list[Any]) -> list[MeasuredColumn]:
@@ -143,44 +128,21 @@ def _columns(path: Path, headings: list[str], numbers: list[Any]) -> list[Measur
     ]
 
 
-def _bytes(path: Path) -> bytes:
-    """Return the bytes of a file. Raises ApcError E701."""
-    try:
-        return read_file(path, LARGEST)
-    except RefusedError as refused:
-        message = f"the recording {path} {refused.words}"
-        raise ApcError(Diagnostic("E701", SourceLocation(str(path)), message)) from None
-
-
-def _unreadable(path: Path, kind: str) -> ApcError:
-    """Return the error E711 for a file that is not of its format, or has other data than numbers."""
-    return _fault(path, "E711", "recording", f"columns of numbers in a {kind} file", "other data")
-
-
 def _interval(path: Path, times: Floats) -> Fraction:
     """Return the interval of equidistant times, the simplest fraction of a second. Raises ApcError E712."""
     steps = np.diff(times)
     if not len(steps):
         raise _fault(path, "E712", "rows", "two or more", f"{len(times)}")
-    back = np.flatnonzero(steps <= 0)
-    if len(back):
-        got = f"{times[back[0] + 1]:.9g} s after {times[back[0]]:.9g} s in row {back[0] + 2}"
-        raise _fault(path, "E712", "time", "increasing times", got)
     step = float(np.median(steps))
-    gaps = np.flatnonzero(np.abs(steps - step) > UNEVEN * step)
-    if len(gaps):
-        after = f"after row {gaps[0] + 1}, at {times[gaps[0]]:.9g} s"
-        advice = "fit one part of the recording without gaps, or resample it at equal intervals"
-        expected, got = f"equal intervals of {1e3 * step:.6g} ms", f"{1e3 * steps[gaps[0]]:.6g} ms {after}"
-        raise _fault(path, "E712", "time", expected, got, advice)
+    gaps = np.flatnonzero(np.abs(steps - step) > UNEVEN * abs(step))
+    got = f"{1e3 * steps[gaps[0]]:.6g} ms after row {gaps[0] + 1}" if len(gaps) else "a drift"
     mean = float(times[-1] - times[0]) / len(steps)
-    for limit in LIMITS:
+    for limit in LIMITS if step > 0 and not len(gaps) else ():
         interval = Fraction(mean).limit_denominator(limit)
-        even = times[0] + np.arange(len(times)) * float(interval)
-        if np.abs(times - even).max() <= UNEVEN * mean:
+        if np.abs(times - times[0] - np.arange(len(times)) * float(interval)).max() <= UNEVEN * mean:
             return interval
-    expected, advice = f"equal intervals of {1e3 * mean:.6g} ms", "resample the recording at equal intervals"
-    raise _fault(path, "E712", "time", expected, "a drifting interval", advice)
+    advice = "fit one part of the recording without gaps, or resample it at equal intervals"
+    raise _fault(path, "E712", "time", f"equal intervals of {1e3 * step:.6g} ms", got, advice)
 
 
 def _fault(path: Path, code: str, message: str, expected: str, got: str, advice: str = "") -> ApcError:
