@@ -341,7 +341,11 @@ FREE = {MASS: "0.05 kg:1 kg"}
             {MASS: "0.6 kg:1 kg"},
             "E714 start value of device.mass: expected 0.6 kg to 1 kg",
         ),
-        (f"0,1,0\n{ROW}\n", FREE | {DAMPING: "0 N*s/m:9 N*s/m"}, "E712 samples: expected more samples"),
+        (
+            f"0,1,0\n{ROW}\n",
+            FREE | {DAMPING: "0 N*s/m:9 N*s/m"},
+            "E712 samples at ticks: expected more than 2 parameters, got 2",
+        ),
         ("0,1,0\n0.001,0,0\n0.002,0,0\n", {"hand.force": "-1 N:1 N"}, "E715 hand.force: no effect"),
     ],
 )

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from fractions import Fraction
 from pathlib import Path
 from typing import Any, ClassVar, Unpack
 
@@ -54,9 +55,10 @@ SINGULAR = 1e-8
 NAMED = 0.1  # share of a singular vector, relative to its largest, above which a parameter belongs to it
 NO_EFFECT = 1e-12  # relative change of a signal over the range of a parameter that counts as rounding
 EXACT = 1e-9  # residuals, relative to the signal, that count as rounding: their correlation has no meaning
-TOLERANCE = 1e-12  # of least_squares: changes of the sum of squares and of parameters, and the gradient
-MOST_EVALUATIONS = 200
-MOST_ROUNDS, SETTLED = 50, 1e-6  # of the noise of each signal: rounds, and the relative change at the end
+# Of SciPy's least_squares: changes of the sum of squares and of parameters, the gradient, and evaluations.
+TOLERANCES = {"ftol": 1e-12, "xtol": 1e-12, "gtol": 1e-12, "max_nfev": 200}
+MOST_EVALUATIONS = 1000
+SETTLED = 1e-6  # relative change of the noise of each signal at the end
 AT_END = 1e-6  # share of the range within which an estimate counts as at its end
 LAGS = (
     10  # of the whiteness test, at most a fifth of the rows (Hyndman and Athanasopoulos, FPP3, section 5.4)
@@ -214,26 +216,25 @@ def fit(
                 location, fix = SourceLocation(system.origin.topology), f"apc run {system.origin.topology}"
                 raise ApcError(Diagnostic("E713", location, message, fix=fix))
         recorded = recorded_signals(system, read_recording(recording), signals)
-    return _solve(_problem_of(system, recorded, str(recording), tuple(free), method))
+    settings = Settings(recorded.duration, method, jit=False)
+    return _solve(_problem_of(system, recorded, str(recording), free, settings))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Problem:
     """A least-squares problem over shares of the ranges, from 0 to 1.
 
-    `method` is the integration method. `system` has the sensitivities; `low` and `width` (k,) are those of
-    the ranges. `rows` are the simulated rows at recorded instants, and `measured` (samples, signals) the
-    values there. `scale` (signals,) is the spread of each signal.
+    `system` has the sensitivities; `start` (k,) are the shares of its present values. `rows` are the
+    simulated rows at recorded instants, `time` (samples,) and `measured` (samples, signals) the values there.
+    `scale` (signals,) is the spread of each signal.
     """
 
     topology: str
     file: str
     recorded: RecordedSignals
-    free: tuple[Range, ...]
-    method: Method
+    free: Sequence[Range]
+    settings: Settings
     system: Model
-    low: Floats
-    width: Floats
     start: Floats
     rows: Integers
     time: Floats
@@ -242,91 +243,79 @@ class _Problem:
 
     def values(self, shares: Floats) -> Floats:
         """Return the parameters (k,) in SI at shares of their ranges."""
-        return np.clip(self.low + self.width * shares, self.low, self.low + self.width)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Outputs:
-    """Simulated signals (samples, signals) and their derivatives over shares (samples, signals, k)."""
-
-    values: Floats
-    slopes: Floats
+        low, high = np.array([(float(item.low), float(item.high)) for item in self.free]).T
+        return np.asarray(np.clip(low + (high - low) * shares, low, high))
 
 
 def _problem_of(
-    system: Model, recorded: RecordedSignals, file: str, free: tuple[Range, ...], method: Method
+    system: Model, recorded: RecordedSignals, file: str, free: Sequence[Range], settings: Settings
 ) -> _Problem:
     """Return the least-squares problem of a recording. Raises ApcError E712 for a short recording."""
     check_length(recorded.system, recorded.duration)
-    low = np.array([float(item.low) for item in free])
-    width = np.array([float(item.high) for item in free]) - low
-    now = np.array([value_now(system, item.free) for item in free])
-    simulation = prepare(recorded.system, Settings(recorded.duration, method, jit=False))
-    frame = simulation.frame * simulation.quantum
-    if recorded.duration < frame:
-        expected = f"at least one frame, {1e3 * float(frame):.6g} ms"
-        raise _short(file, "duration", expected, f"{1e3 * float(recorded.duration):.6g} ms")
+    simulation = prepare(recorded.system, settings)
     last = int(recorded.duration / simulation.quantum)
     instants, is_row = instants_of(simulation, 0, last // simulation.frame + 1, last)
-    ticks = np.asarray(instants[is_row] * float(simulation.quantum))
-    rows, indices = _common(ticks, recorded.times)
-    if len(rows) * len(recorded.signals) <= len(free):
-        expected = f"more samples at ticks of the clocks than the {len(free)} free parameters"
-        raise _short(file, "samples", expected, str(len(rows) * len(recorded.signals)))
-    measured = recorded.values[indices]
+    ticks, tolerance = instants[is_row] * float(simulation.quantum), AT_END * float(simulation.quantum)
+    indices = np.minimum(np.searchsorted(recorded.times, ticks - tolerance), len(recorded.times) - 1)
+    rows = np.flatnonzero(np.abs(recorded.times[indices] - ticks) <= tolerance)
+    measured, frame = recorded.values[indices[rows]], simulation.frame * simulation.quantum
+    for message, enough, expected, got in (
+        ("duration", last >= simulation.frame, f"at least one frame, {_ms(frame)}", _ms(recorded.duration)),
+        (
+            "samples at ticks",
+            len(rows) > len(free),
+            f"more than {len(free)} parameters",
+            f"{len(rows)}",
+        ),
+    ):
+        if not enough:
+            advice = "use a longer recording, or rows at the ticks of the clocks"
+            raise ApcError(Diagnostic("E712", SourceLocation(file), message, expected, got, advice=advice))
     spread = np.maximum(measured.std(axis=0), EXACT * np.abs(measured).max(axis=0))
     return _Problem(
         topology=system.name,
         file=file,
         recorded=recorded,
         free=free,
-        method=method,
+        settings=settings,
         system=with_sensitivities(recorded.system, free),
-        low=low,
-        width=width,
-        start=np.clip((now - low) / width, 0.0, 1.0),
+        start=np.array(
+            [(value_now(system, one.free) - float(one.low)) / float(one.high - one.low) for one in free]
+        ).clip(0, 1),
         rows=rows,
-        time=recorded.times[indices],
+        time=recorded.times[indices[rows]],
         measured=measured,
         scale=np.where(spread > 0, spread, 1.0),
     )
 
 
-def _short(file: str, message: str, expected: str, got: str) -> ApcError:
-    """Return the error E712 for a recording that is too short."""
-    advice = "use a longer recording, or rows at the ticks of the clocks"
-    return ApcError(Diagnostic("E712", SourceLocation(file), message, expected, got, advice=advice))
+def _ms(seconds: Fraction) -> str:
+    """Return a time as text in ms."""
+    return f"{1000 * float(seconds):.6g} ms"
 
 
-def _common(ticks: Floats, times: Floats) -> tuple[Integers, Integers]:
-    """Return the indices of equal instants among ticks and recorded times."""
-    tolerance = AT_END * float(np.diff(times).min())
-    nearest = np.minimum(np.searchsorted(times, ticks - tolerance), len(times) - 1)
-    rows = np.flatnonzero(np.abs(times[nearest] - ticks) <= tolerance)
-    return rows, nearest[rows]
+def _simulate(problem: _Problem, shares: Floats) -> Floats:
+    """Return the signals and their derivatives over shares (samples, signals, 1 + k).
 
-
-def _simulate(problem: _Problem, shares: Floats) -> _Outputs | None:
-    """Return the signals and their derivatives at shares of the ranges, None for a diverging motion."""
-    count, recorded = len(problem.free), problem.recorded
-    system = with_values(problem.system, problem.free, problem.values(shares))
+    They are infinite if the motion diverges.
+    """
+    recorded = problem.recorded
     names = [
-        f"{signal.group}[{signal.peer}].{name_of(k, signal.local) if k else signal.local}"
+        f"{signal.group}[{signal.peer}].{name_of(k, signal.local)}"
         for signal in recorded.signals
-        for k in range(count + 1)
+        for k in range(len(shares) + 1)
     ]
-    simulation = prepare(system, Settings(recorded.duration, problem.method, jit=False), signals=names)
-    run, player = recorded.run, None
+    system = with_values(problem.system, problem.free, problem.values(shares))
+    simulation, run, player = prepare(system, problem.settings, signals=names), recorded.run, None
     if run is not None:
         population = simulation.population
         player = InterpretedEngine(population, lambda _: DeliveredRun(run, population))
     rows = np.concatenate([block.values for block in blocks(simulation, player=player)])
+    shape = len(problem.rows), len(recorded.signals), len(shares) + 1
     if len(rows) <= problem.rows[-1]:
-        return None
-    column = {signal.name: index for index, signal in enumerate(simulation.signals)}
-    order = [column[name] for name in names]
-    outputs = rows[problem.rows][:, order].reshape(len(problem.rows), -1, count + 1)
-    return _Outputs(outputs[..., 0], outputs[..., 1:])
+        return np.full(shape, np.inf)
+    order = {signal.name: index for index, signal in enumerate(simulation.signals)}
+    return rows[problem.rows][:, [order[name] for name in names]].reshape(shape)
 
 
 def _solve(problem: _Problem) -> ParameterFit:
@@ -338,100 +327,79 @@ def _solve(problem: _Problem) -> ParameterFit:
         E715 the recording does not determine a parameter, E716 the motion diverges or the search fails.
     """
     least_squares = load_pool("scipy.optimize").least_squares
-    known: dict[bytes, _Outputs | None] = {}
+    known: dict[bytes, Floats] = {}
     evaluations = 0
 
-    def outputs(shares: Floats) -> _Outputs | None:
+    def outputs(shares: Floats) -> Floats:
         """Return the outputs at shares; the last ones are kept."""
         nonlocal evaluations
-        key = shares.tobytes()
-        if key not in known:
+        if shares.tobytes() not in known:
             known.clear()
-            known[key] = _simulate(problem, shares)
+            known[shares.tobytes()] = _simulate(problem, shares)
             evaluations += 1
-        return known[key]
+        return known[shares.tobytes()]
 
     def residuals(shares: Floats, noise: Floats) -> Floats:
-        """Return the residuals relative to the noise; infinite for a diverging motion."""
-        found = outputs(shares)
-        if found is None:
-            return np.full(problem.measured.size, np.inf)
-        return ((found.values - problem.measured) / noise).ravel()
+        """Return the residuals relative to the noise."""
+        return np.asarray((outputs(shares)[..., 0] - problem.measured) / noise).ravel()
 
     def slopes(shares: Floats, noise: Floats) -> Floats:
         """Return the Jacobian of `residuals`."""
-        found = outputs(shares)
-        assert found is not None  # SciPy accepts no diverging motion
-        return (found.slopes / noise[:, None]).reshape(-1, len(problem.free))
+        return (outputs(shares)[..., 1:] / noise[:, None]).reshape(-1, len(shares))
 
     shares, noise = problem.start, problem.scale
-    if outputs(shares) is None:
-        location = SourceLocation(problem.recorded.system.origin.topology)
-        message = "the motion diverges at the start values of the free parameters"
-        raise ApcError(Diagnostic("E716", location, message, advice="start from values of a stable topology"))
-    tolerances = dict.fromkeys(("ftol", "xtol", "gtol"), TOLERANCE)
-    for _ in range(MOST_ROUNDS):
+    message = "the motion diverges at the start values of the free parameters"
+    advice = "start from values of a stable topology"
+    while evaluations < MOST_EVALUATIONS and np.isfinite(outputs(shares)).all():
         solution = least_squares(
-            residuals,
-            shares,
-            slopes,
-            bounds=(0.0, 1.0),
-            x_scale="jac",
-            max_nfev=MOST_EVALUATIONS,
-            kwargs={"noise": noise},
-            **tolerances,
+            residuals, shares, slopes, bounds=(0, 1), x_scale="jac", **TOLERANCES, kwargs={"noise": noise}
         )
-        shares = solution.x
-        found = outputs(shares)
-        assert found is not None
-        rms = np.sqrt(np.mean((found.values - problem.measured) ** 2, axis=0))
-        last, noise = noise, np.maximum(rms, EXACT * problem.scale)
+        shares, last = solution.x, noise
+        rms = np.sqrt(np.mean((outputs(shares)[..., 0] - problem.measured) ** 2, axis=0))
+        noise = np.maximum(rms, EXACT * problem.scale)
         if solution.success and (len(noise) == 1 or np.abs(noise / last - 1).max() < SETTLED):
-            return _result(problem, shares, found, evaluations)
-        if not solution.success:
-            break
-    message = f"no minimum within {evaluations} simulations"
-    advice = "use narrower ranges, or fewer free parameters"
+            return _result(problem, shares, outputs(shares), evaluations)
+        message = f"no minimum within {evaluations} simulations"
+        advice = "use narrower ranges, or fewer free parameters"
     raise ApcError(Diagnostic("E716", SourceLocation(problem.file), message, advice=advice))
 
 
-def _result(problem: _Problem, shares: Floats, found: _Outputs, evaluations: int) -> ParameterFit:
+def _result(problem: _Problem, shares: Floats, found: Floats, evaluations: int) -> ParameterFit:
     """Return the estimates with their statistics, from the outputs at the solution."""
     from scipy.stats import t as student
 
-    difference = problem.measured - found.values
+    recorded, difference = problem.recorded, problem.measured - found[..., 0]
     rms = np.sqrt(np.mean(difference**2, axis=0))
-    effects = np.abs(found.slopes).max(axis=0) / problem.scale[:, None]
-    used = effects.max(axis=1) > NO_EFFECT
     noise = np.maximum(rms, EXACT * problem.scale)
-    jacobian = (found.slopes / noise[:, None])[:, used].reshape(-1, len(shares))
-    _check_determined(problem, jacobian, effects.max(axis=0) > NO_EFFECT)
+    effects = np.abs(found[..., 1:]).max(axis=0) / problem.scale[:, None] > NO_EFFECT
+    used = effects.any(axis=1)
+    jacobian = (found[..., 1:] / noise[:, None])[:, used].reshape(-1, len(shares))
+    lengths = np.where(effects.any(axis=0), np.linalg.norm(jacobian, axis=0), 1.0)
+    _, singular, right = np.linalg.svd(jacobian / lengths, full_matrices=False)
+    _check_determined(problem, effects.any(axis=0), singular, right)
     freedom = len(jacobian) - len(shares)
     variance = float(np.sum((difference / noise)[:, used] ** 2)) / freedom
-    lengths = np.linalg.norm(jacobian, axis=0)
-    _, singular, right = np.linalg.svd(jacobian / lengths, full_matrices=False)
     covariance = (right.T / singular**2) @ right  # of the parameters times `lengths`, for unit variance
     deviation = np.sqrt(np.diag(covariance))
-    errors = np.sqrt(variance) * deviation / lengths * problem.width
-    margin = float(student.ppf((1 + CONFIDENCE) / 2, freedom)) * errors
-    values = problem.values(shares)
+    widths = np.array([float(item.high - item.low) for item in problem.free])
+    errors = np.sqrt(variance) * deviation / lengths * widths
+    quantile = float(student.ppf((1 + CONFIDENCE) / 2, freedom))
+    numbers = zip(problem.free, problem.values(shares).tolist(), errors.tolist(), shares, strict=True)
     return ParameterFit(
         topology=problem.topology,
         recording=problem.file,
         parameters=tuple(
             Estimate(
                 name=item.free.label,
-                value=float(value),
+                value=value,
                 unit=item.unit,
-                standard_error=float(error),
-                interval=(float(value - half), float(value + half)),
+                standard_error=error,
+                interval=(value - quantile * error, value + quantile * error),
                 low=float(item.low),
                 high=float(item.high),
                 at_end=not AT_END < share < 1 - AT_END,
             )
-            for item, value, error, half, share in zip(
-                problem.free, values, errors, margin, shares, strict=True
-            )
+            for item, value, error, share in numbers
         ),
         correlation=tuple(map(tuple, (covariance / np.outer(deviation, deviation)).tolist())),
         residuals=tuple(
@@ -439,24 +407,25 @@ def _result(problem: _Problem, shares: Floats, found: _Outputs, evaluations: int
                 signal.name,
                 signal.unit,
                 float(rms[j]),
-                *_ljung_box(difference[:, j], exact=bool(rms[j] <= EXACT * problem.scale[j])),
-                used=bool(used[j]),
+                min(LAGS, len(difference) // 5),
+                _ljung_box(difference[:, j]) if rms[j] > EXACT * problem.scale[j] else float("nan"),
+                bool(used[j]),
             )
-            for j, signal in enumerate(problem.recorded.signals)
+            for j, signal in enumerate(recorded.signals)
         ),
-        rows=len(problem.recorded.times),
+        rows=len(recorded.times),
         samples=len(problem.rows),
-        duration=float(problem.recorded.duration),
-        start=problem.recorded.start,
-        forces=problem.recorded.forces,
+        duration=float(recorded.duration),
+        start=recorded.start,
+        forces=recorded.forces,
         evaluations=evaluations,
         time=problem.time,
         measured=problem.measured,
-        fitted=found.values,
+        fitted=found[..., 0],
     )
 
 
-def _check_determined(problem: _Problem, jacobian: Floats, has_effect: Flags) -> None:
+def _check_determined(problem: _Problem, has_effect: Flags, singular: Floats, right: Floats) -> None:
     """Raise ApcError E715 with the parameters that the recording does not determine.
 
     The Fisher information JᵀJ is singular where a singular value of J is 0: a parameter without effect, or a
@@ -464,44 +433,33 @@ def _check_determined(problem: _Problem, jacobian: Floats, has_effect: Flags) ->
 
     Parameters
     ----------
-    problem
-        The problem.
-    jacobian
-        The derivatives of the residuals (residuals, k).
-    has_effect
-        Whether each parameter has an effect on a signal (k,).
+    problem, has_effect
+        The problem, and whether each parameter has an effect on a signal (k,).
+    singular, right
+        The singular values of J, its columns of length 1, and the right singular vectors (k, k).
     """
-    names = [item.free.label for item in problem.free]
-    idle = [name for name, effect in zip(names, has_effect, strict=True) if not effect]
-    if idle:
-        message = f"{', '.join(idle)}: no effect on the measured signals"
-        advice = "omit its --free, or record a motion on which it acts"
-        raise ApcError(Diagnostic("E715", SourceLocation(problem.file), message, advice=advice))
-    scaled = jacobian / np.linalg.norm(jacobian, axis=0)
-    _, singular, right = np.linalg.svd(scaled, full_matrices=False)
-    if singular[-1] > SINGULAR * singular[0]:
-        return
-    weights = np.abs(right[singular <= SINGULAR * singular[0]]).max(axis=0)
-    among = [name for name, weight in zip(names, weights, strict=True) if weight > NAMED * weights.max()]
-    message = f"{', '.join(among)}: only a combination of these has an effect on the measured signals"
-    advice = f"fix one of them: omit the --free of {among[-1]}, or record another signal"
+    names = np.array([item.free.label for item in problem.free])
+    message, advice = f"{', '.join(names[~has_effect])}: no effect on the measured signals", ""
+    if has_effect.all():
+        weights = np.abs(right[singular <= SINGULAR * singular[0]]).max(axis=0, initial=0.0)
+        among = names[weights > NAMED * weights.max()]
+        if not len(among):
+            return
+        message = f"{', '.join(among)}: only a combination of these has an effect on the measured signals"
+        advice = f"fix one of them, without --free {among[-1]}, or record another signal"
+    advice = advice or "omit its --free, or record a motion on which it acts"
     raise ApcError(Diagnostic("E715", SourceLocation(problem.file), message, advice=advice))
 
 
-def _ljung_box(residuals: Floats, *, exact: bool) -> tuple[int, float]:
-    """Return the lags and the probability of a Ljung-Box test (Ljung and Box, Biometrika 65, 1978, 297).
+def _ljung_box(residuals: Floats) -> float:
+    """Return the probability of a Ljung-Box test, NaN for too few residuals.
 
     Q = n (n + 2) Σ_h r_h² / (n − h) is distributed as χ² with as many degrees of freedom as lags, for white
-    residuals with autocorrelations r_h.
+    residuals with autocorrelations r_h (Ljung and Box, Biometrika 65, 1978, 297).
     """
     from scipy.stats import chi2
 
-    n = len(residuals)
-    lags = min(LAGS, n // 5)
-    centered = residuals - residuals.mean()
-    power = float(centered @ centered)
-    if exact or not lags or not power:
-        return lags, float("nan")
-    r = np.array([centered[h:] @ centered[: n - h] for h in range(1, lags + 1)]) / power
-    statistic = n * (n + 2) * float(np.sum(r**2 / (n - np.arange(1, lags + 1))))
-    return lags, float(chi2.sf(statistic, lags))
+    n, centered = len(residuals), residuals - residuals.mean()
+    h = np.arange(1, min(LAGS, n // 5) + 1)
+    r = np.array([centered[lag:] @ centered[:-lag] for lag in h]) / (centered @ centered)
+    return float(chi2.sf(n * (n + 2) * np.sum(r**2 / (n - h)), len(h)))

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from fnmatch import fnmatchcase
 from fractions import Fraction
 from typing import Any
 
@@ -89,7 +88,7 @@ def recorded_signals(system: Model, table: MeasuredTable, patterns: Sequence[str
         The recording. A column is named by a signal of `simulate`, by a hand with a constant force, which it
         replaces, or by a part, on which it acts. A name needs the peer only where several peers have it.
     patterns
-        Patterns of the measured signals to use; by default all.
+        Patterns of the measured signals to use, as for `simulate`; by default all.
 
     Raises
     ------
@@ -151,7 +150,7 @@ def signals_of_run(system: Model, run: RealtimeRun, patterns: Sequence[str] = ()
     Raises
     ------
     ApcError
-        E711 no signal matches, E713 the run is of another topology, or can't be simulated.
+        E713 the run is of another topology, or can't be simulated.
     """
     live = live_topology(system)
     signals = {one.name: one for one in prepare(live, Settings(Fraction(1, 1000), jit=False)).signals}
@@ -182,16 +181,9 @@ def _selected(
     recorded: RecordedSignals, patterns: Sequence[str], file: str, example: Signal
 ) -> RecordedSignals:
     """Return a recording with the signals that match a pattern. Raises ApcError E711 if none does."""
-    chosen = [
-        index
-        for index, signal in enumerate(recorded.signals)
-        if not patterns
-        or any(
-            fnmatchcase(name, pattern.replace("[", "[[]"))
-            for name in (signal.name, signal.local)
-            for pattern in patterns
-        )
-    ]
+    settings = Settings(recorded.duration, jit=False)
+    matching = {*prepare(recorded.system, settings, signals=patterns).signals}
+    chosen = [index for index, signal in enumerate(recorded.signals) if signal in matching]
     if not chosen:
         got = "only forces" if recorded.forces and not recorded.signals else "none"
         raise _fault(file, "measured signals", "one or more", got, example.heading)
