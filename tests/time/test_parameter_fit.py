@@ -10,8 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 from numpy.typing import NDArray
+from scipy.io import savemat
 from scipy.linalg import expm
 from scipy.optimize import least_squares
 from scipy.stats import binom, t
@@ -388,6 +390,43 @@ def test_an_unsuitable_column_is_refused_with_its_fix(
         apc.fit(compiled(HAND), path, free=FREE)
     (mistake,) = error.value.mistakes
     assert expected in str(mistake) and (not fix or mistake.fix == fix)
+
+
+def test_an_unsuitable_file_is_refused(tmp_path: Path) -> None:
+    """Columns of different lengths, other variables, cut files, numbers that are none, and other formats."""
+    time, names = np.arange(20) * 1e-3, np.array(["device.x", "hand"], dtype=object)
+    variables = {
+        "time": time,
+        "values": np.zeros((20, 2)),
+        "names": names,
+        "units": np.array(["m", "N"], object),
+    }
+    frame = pd.DataFrame({"time [s]": time, "device.x [m]": np.zeros(20)})
+    savemat(tmp_path / "short.mat", variables | {"values": np.zeros((19, 2))})
+    savemat(tmp_path / "other.mat", {"t": time})
+    savemat(tmp_path / "whole.mat", variables, do_compression=True)
+    (tmp_path / "cut.mat").write_bytes((tmp_path / "whole.mat").read_bytes()[:-40])
+    frame.assign(**{"device.x [m]": "none"}).to_parquet(tmp_path / "text.parquet")
+    frame.assign(**{"device.x [m]": np.where(time == 0.003, np.nan, 0.0)}).to_parquet(
+        tmp_path / "nan.parquet"
+    )
+    (tmp_path / "push.txt").write_text("time [s]", encoding="utf-8")
+    for name, expected in (
+        (
+            "short.mat",
+            "E711 values: expected 20 rows and 2 columns, as in time, names and units, got 19 by 2",
+        ),
+        ("other.mat", "E711 recording: expected a table in a .csv"),
+        ("cut.mat", "E711 recording: expected a table in a .csv"),
+        ("text.parquet", "E711 recording: expected a table in a .csv"),
+        ("nan.parquet", "E712 device.x, row 4: expected a finite number, got nan"),
+        ("push.txt", "E711 recording: expected a table in a .csv"),
+        ("absent.parquet", "absent.parquet does not exist"),
+        ("absent.csv", "absent.csv does not exist"),
+    ):
+        with pytest.raises(ApcError) as error:
+            apc.fit(compiled(HAND), tmp_path / name, free=FREE)
+        assert expected in str(error.value), name
 
 
 def test_a_name_of_several_peers_is_refused_with_the_name_of_one(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ Does not: relate columns to a model (see `recorded_signals`).
 from __future__ import annotations
 
 import io
+import zlib
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -107,9 +108,12 @@ def _read_parquet(path: Path) -> list[MeasuredColumn]:
 
 def _read_mat(path: Path) -> list[MeasuredColumn]:
     """Return the columns of a MAT file in SI."""
-    from scipy.io import loadmat
+    from scipy.io.matlab import MatReadError, loadmat
 
-    variables = loadmat(io.BytesIO(read_file(path, LARGEST)), variable_names=VARIABLES)
+    try:
+        variables = loadmat(io.BytesIO(read_file(path, LARGEST)), variable_names=VARIABLES)
+    except (MatReadError, NameError, zlib.error) as error:  # a NameError is SciPy's, of some damaged files
+        raise ValueError from error
     time, values, names, units = (variables[name] for name in VARIABLES)
     if time.size != len(values) or not names.size == units.size == values.shape[1]:
         expected = f"{time.size} rows and {names.size} columns, as in time, names and units"
