@@ -544,6 +544,13 @@ def fit(
     ------
     ApcError
         The input is invalid, or the recording does not determine a parameter.
+
+    Examples
+    --------
+    >>> ranges = {"device.mass": ("0.05 kg", "1 kg"), "device.damping": "0 N*s/m:50 N*s/m"}
+    >>> fit = apc.fit("one-device.yaml", "push.csv", free=ranges)
+    >>> {name: round(value, 3) for name, value in fit.params.items()}
+    {'device.mass': 0.2, 'device.damping': 4.0}
     """
     from apc.simulation.settings import DEFAULT, parse_method
 

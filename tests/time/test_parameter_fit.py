@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import doctest
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -21,7 +22,7 @@ from scipy.stats import binom, t
 import apc
 from apc.compiler.errors import ApcError
 from tests.commands import Cli, write
-from tests.topologies import AVERAGE, TOPOLOGIES, compiled, replaced, wall
+from tests.topologies import AVERAGE, ROOT, TOPOLOGIES, compiled, replaced, wall
 
 pytestmark = pytest.mark.needs_extension("parameter_fit")
 
@@ -298,6 +299,13 @@ def test_what_is_written_drawn_and_tabulated(tmp_path: Path, cli: Cli) -> None:
         "N*s/m",
     ]
     assert "is refused" not in ran.err and cli(f"fit {path} t.yaml {free} --write new.txt").code == 1
+
+
+def test_the_example_of_the_docstring_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(ROOT / "docs" / "howto")
+    text = apc.fit.__doc__ or ""
+    example = doctest.DocTestParser().get_doctest(text, {"apc": apc}, "fit", None, None)
+    assert len(example.examples) == 3 and doctest.DocTestRunner().run(example).failed == 0
 
 
 def test_half_of_the_rows_are_at_ticks_of_a_slower_clock(tmp_path: Path) -> None:
