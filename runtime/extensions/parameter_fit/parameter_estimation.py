@@ -216,7 +216,7 @@ def fit(
                 location, fix = SourceLocation(system.origin.topology), f"apc run {system.origin.topology}"
                 raise ApcError(Diagnostic("E713", location, message, fix=fix))
         recorded = recorded_signals(system, read_recording(recording), signals)
-    settings = Settings(recorded.duration, method, jit=False)
+    settings = Settings(recorded.duration, method, jit=recorded.run is None)
     return _solve(_problem_of(system, recorded, str(recording), free, settings))
 
 
@@ -252,7 +252,7 @@ def _problem_of(
 ) -> _Problem:
     """Return the least-squares problem of a recording. Raises ApcError E712 for a short recording."""
     check_length(recorded.system, recorded.duration)
-    simulation = prepare(recorded.system, settings)
+    simulation = prepare(recorded.system, Settings(recorded.duration, jit=False))
     last = int(recorded.duration / simulation.quantum)
     instants, is_row = instants_of(simulation, 0, last // simulation.frame + 1, last)
     ticks, tolerance = instants[is_row] * float(simulation.quantum), AT_END * float(simulation.quantum)
