@@ -227,6 +227,23 @@ def test_derivatives_are_those_of_simulations_nearby(name: str, free: list[str])
     assert compared > 2
 
 
+def test_a_model_at_rest_is_fitted(tmp_path: Path) -> None:
+    """The force that holds it there is a start value, which no parameter changes."""
+    from apc.extensions.parameter_fit.sensitivity_model import with_sensitivities
+    from apc.parameter_values.parameter_names import ParameterRef, Range
+
+    spring = "{type: SampledSpringDamper, a: device, b: ground, stiffness: 300 N/m, clock: tick, delay: 1 ms}"
+    text = HAND.replace("force: 0 N", "force: 1 N").replace("masses:", "clocks: {tick: 1 ms}\nmasses:")
+    model = apc.operating_point(compiled(f"{text}couplers: {{spring: {spring}}}\n")).model
+    ranges = [Range(ParameterRef(STIFFNESS), "N/m", Fraction(100), Fraction(900))]
+    rest = apc.simulate(with_sensitivities(model, ranges), duration=0.01)
+    assert rest["user[1].d1 spring.f acting"][0] == 0 != rest["user[1].spring.f acting"][0]
+    stiff = apc.simulate(apc.set_parameters(model, {STIFFNESS: 400.0}), duration=0.3)
+    path = table(tmp_path / "r.csv", {"device.x [m]": stiff["user[1].device.x"]}, 1e-3)
+    found = apc.fit(model, path, free={STIFFNESS: (100.0, 900.0)})
+    assert found.params[STIFFNESS] == pytest.approx(400.0, rel=1e-8)
+
+
 def test_a_run_is_fitted_with_the_packets_that_arrived(cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("apc.realtime.start.claim", tuple)
     changes = [

@@ -48,7 +48,7 @@ Integers = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 
 FREE = SourceLocation("--free")
-CONFIDENCE = 0.95
+CONFIDENCE = 0.95  # of the intervals, the usual one
 # Relative singular value of the Jacobian, its columns of length 1, below which a combination of parameters is
 # undetermined: its standard error is 1e8 times that of one parameter. Derivatives are exact to about 1e-12.
 SINGULAR = 1e-8
@@ -57,7 +57,7 @@ NO_EFFECT = 1e-12  # relative change of a signal over the range of a parameter t
 EXACT = 1e-9  # residuals, relative to the signal, that count as rounding: their correlation has no meaning
 # Of SciPy's least_squares: changes of the sum of squares and of parameters, the gradient, and evaluations.
 TOLERANCES = {"ftol": 1e-12, "xtol": 1e-12, "gtol": 1e-12, "max_nfev": 200}
-MOST_EVALUATIONS = 1000
+MOST_EVALUATIONS = 1000  # simulations of one fit: most fits take about ten
 SETTLED = 1e-6  # relative change of the noise of each signal at the end
 AT_END = 1e-6  # share of the range within which an estimate counts as at its end
 LAGS = (

@@ -126,7 +126,12 @@ class _Extension:
                 for state in original.states
             ),
             holds=tuple(
-                replace(hold, name=name_of(k, hold.name), output=hold.output + k * outputs[hold.clock])
+                replace(
+                    hold,
+                    name=name_of(k, hold.name),
+                    output=hold.output + k * outputs[hold.clock],
+                    start=hold.start and name_of(k, hold.start),
+                )
                 for k in self.orders
                 for hold in original.holds
             ),
