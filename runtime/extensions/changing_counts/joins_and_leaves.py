@@ -24,6 +24,7 @@ that stay have deviations of opposite sign, and those that join and leave have n
 from __future__ import annotations
 
 import itertools
+import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
@@ -277,7 +278,9 @@ def _has_common_function(matrices: Sequence[Matrix]) -> bool:
     constraints = [unknown - step.T @ unknown @ step >> np.eye(n) for step in steps]
     problem = cvxpy.Problem(cvxpy.Minimize(cvxpy.trace(unknown)), constraints)
     try:
-        problem.solve(solver=cvxpy.CLARABEL)
+        with warnings.catch_warnings():  # of an inaccurate solution, which is verified below
+            warnings.simplefilter("ignore")
+            problem.solve(solver=cvxpy.CLARABEL)
     except cvxpy.error.SolverError:
         return False
     if unknown.value is None:
