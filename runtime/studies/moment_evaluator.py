@@ -41,6 +41,10 @@ from apc.studies.stability_criteria import BOUNDED, MEAN_SQUARE, NOWHERE, Radius
 
 Floats = NDArray[np.float64]
 
+# The relative error of an entry of a frame map in floats; an entry of 0 is exact. Only the test of
+# neutral motions uses it: a smaller one refuses stiff couplings (tests/networks/test_moment_evaluator.py).
+ROUNDED = 1e-12
+
 
 @dataclass(frozen=True, eq=False)
 class MomentEvaluator(RadiusEvaluator):
@@ -90,9 +94,9 @@ class MomentEvaluator(RadiusEvaluator):
         names = {subsystem.name: subsystem.index for subsystem in self.classes.common.subsystems}
 
         def at_point(block: NDArray[np.complex128], k: int) -> Floats:
-            """Return a matrix at one point with a radius of 0, and its derivative (2 or 3, n, n)."""
+            """Return a matrix at one point with its error radius, and its derivative (2 or 3, n, n)."""
             item = block[min(k, len(block) - 1)]
-            parts = [item.real, np.zeros(item.shape)]
+            parts = [item.real, ROUNDED * np.abs(item.real)]
             return np.stack(parts if along is None else [*parts, item.imag / STEP])
 
         return [

@@ -75,3 +75,12 @@ def test_at_zero_further_neutral_motions_are_left_out(lossy: apc.Model) -> None:
     """Without a coordinating stiffness each copy translates alone; the other motions decay."""
     analyses, evaluator = evaluators(lossy, PARAMETERS[1])
     assert evaluator.verdict([0.0]).radius == analyses.verdict([0.0]).radius < 1
+
+
+def test_a_stiff_contact_is_evaluated_as_by_analyses(lossy: apc.Model) -> None:
+    """Its frame map has rounding errors far above those of one product of floats."""
+    analyses, evaluator = evaluators(lossy, *PARAMETERS)
+    assert isinstance(evaluator, MomentEvaluator)
+    for stiffness in (2500.0, 12500 / 3, 5000.0):
+        value = (stiffness, 125.0)
+        assert evaluator.verdict(value).radius == pytest.approx(analyses.verdict(value).radius, rel=1e-12)
