@@ -378,7 +378,7 @@ def _of_part(
     """Return a parameter or start value of a part, with its bounds and its description."""
     declared = all_declared[name]
     if isinstance(declared, ComponentVariable):
-        return _named(name, value, f"start value: {declared.description}")
+        return _named(name, value, f"start value: {declared.description or name.rpartition('.')[2]}")
     least, most = declared.minimum, declared.maximum
     return _named(
         name, value, declared.description, least, most, exclusive_minimum=declared.exclusive_minimum
@@ -421,7 +421,7 @@ def all_parameters(
             parameters += [_named(*number, description, 0, 1) for number, description in probabilities]
     for clock in topology.clocks:
         if (name := f"{clock.name}.period") in needed:  # used by `interval`: the same number as the timing
-            description = f"from one tick of {clock.name} to the next"
+            description = f"period of clock {clock.name}"
             parameters.append(_named(name, clock.period, description, 0, exclusive_minimum=True))
     for group in topology.groups:
         expression = None if group.counted is None else group.counted.expression

@@ -102,9 +102,12 @@ class ChannelDeclaration:
         """The properties of the channel, each as a text."""
         lines = []
         if self.loss:
+            p, r, bad_loss, good_loss = (value.number for _, value in self.loss)
             four = zip(PROBABILITIES, self.loss, strict=True)
             shares = (f"{key} {float(100 * value.number):.6g} %" for key, (_, value) in four)
-            lines.append(f"Gilbert–Elliott loss: {', '.join(shares)}")
+            independent = r == 1 - p and bad_loss == 1 and good_loss == 0
+            model = f"Gilbert–Elliott loss: {', '.join(shares)}"
+            lines.append(f"independent loss {float(100 * p):.6g} %" if independent else model)
         if self.jitter is not None:
             lines.append(f"jitter {float(1000 * self.jitter.number):.6g} ms, {self.distribution}")
         if self.trace is not None:

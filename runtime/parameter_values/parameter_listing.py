@@ -146,9 +146,9 @@ def _time(system: Model, timing: Timing) -> Settable:
     description = ""
     for clock in system.clocks:
         if timing.name == clock.period:
-            description = f"from one tick of {clock.name} to the next"
+            description = f"period of clock {clock.name}"
         if timing.name == clock.phase:
-            description = f"first tick of {clock.name}, below its period"
+            description = f"first tick of clock {clock.name}, below its period"
     if any(timing.name == link.delay for link in system.links):
         description = "from sending a packet to its availability at the receiver"
     text = next(
