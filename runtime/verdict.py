@@ -78,8 +78,8 @@ class ProofMethod(Term):
     ANALYSED_BESIDE = "analyzed on both sides"
     BOTH_COUNTS = "both analyzed"
     SOME_COUNTS = "some counts are undecided"
-    BOUNDED_MOMENTS = "second moments bounded on both sides"
-    BOUNDED_HANDS = "passivity bounded on both sides"
+    BOUNDED_MOMENTS = "rigorous second-moment bounds"
+    BOUNDED_HANDS = "rigorous passivity bounds"
     ITERATED_MOMENTS = "second moments by floating-point iteration, not proved"
     ESTIMATED_MOMENTS = "estimate from estimated second moments, not proved"
 

@@ -112,7 +112,8 @@ class StateSpace(Result):
     @property
     def meaning(self) -> str:
         """A text on the hold of inputs and the instants of outputs."""
-        step = f"x[k+1] = A x[k] + B u[k], y[k] = C x[k] + D u[k], one step a frame of {self.frame_s!r} s"
+        step = "x[k+1] = A x[k] + B u[k], y[k] = C x[k] + D u[k], "
+        step += f"one step per frame of {1e3 * self.frame_s:g} ms"
         if self.open_at:
             closing = "as by control.feedback(system, the identity), it is the closed loop"
             return f"{step}, cut at {self.open_at}: closed again by u = -y, {closing}."

@@ -328,7 +328,7 @@ def _mean_square_stability(numeric: NumericModel, *, certify: bool) -> MeanSquar
         UNPROVED if certify and decided and not result.proved else "",
         result.note,
         exponent_note,
-        unmeasured and f"root mean square error of copies: {unmeasured}",
+        unmeasured and f"coordination error not available: {unmeasured}",
         worst.note if worst is not None else "",
         "" if extension else str(not_installed("loss_models")),
     )

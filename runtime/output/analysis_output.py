@@ -42,7 +42,7 @@ from apc.output.formatting import (
 )
 from apc.output.margins_output import margins_lines, sensitivities_lines
 from apc.output.operating_point_output import rest_lines
-from apc.output.pictures import COLOURS, legend_below, new_figure
+from apc.output.pictures import COLOURS, legend_below, new_figure, notes_below
 from apc.support.optional import need
 from apc.verdict import StabilityVerdict
 
@@ -66,8 +66,8 @@ LEAST_MAGNITUDE = 1e-6  # its six digits would show as zero
 LARGE = 1e4  # a larger magnitude needs another notation to fit its column
 LEAST_SHARE = 0.005  # shows as zero
 PAST = "(-"  # in the name of a state that is a past value, such as x(-1 ms)
-HEADINGS = ("|eigenvalue|", "type", "mult.", "frequency", "damping", "participation")
-MODES = "Modes (slowest first; a conjugate pair is one row)"
+HEADINGS = ("|eigenvalue|", "type", "f [Hz]", "damping", "participation [%]")
+MODES = "Modes (slowest first; × n: multiplicity; a conjugate pair is one row)"
 
 NOT_SIMULATED = "not predicted: --limit-cycle"
 SHOWN = 1e-9  # digits of a contact mode's spectral radius that its column has room for
@@ -184,8 +184,9 @@ def _summary(result: Analysis, warnings: Sequence[str] = ()) -> Lines:
     if result.modes and _is_alive(dominant := result.modes[0]):
         known = not math.isnan(dominant.frequency_hz)
         turns = in_hertz(dominant.frequency_hz) if known else "frequency undetermined"
-        turns = turns if dominant.frequency_hz else "real"
-        ratio = "" if math.isnan(dominant.damping_ratio) else f", damping ratio {dominant.damping_ratio:.3g}"
+        turns = turns if dominant.frequency_hz else "real eigenvalue"
+        damped = dominant.frequency_hz and not math.isnan(dominant.damping_ratio)
+        ratio = f", damping ratio {dominant.damping_ratio:.3g}" if damped else ""
         rows.append(("dominant mode", f"{dominant.family}, {turns}{ratio}"))
     if result.settling_s:
         rows.append(("settling time", f"{quantity(result.settling_s, 's', 3)} (to {100 * SETTLED:g} %)"))
@@ -355,7 +356,7 @@ def _mode_table(modes: Sequence[Mode], *, everything: bool = False) -> Lines:
     least = max(shown[-1].magnitude if shown else 0.0, 2 * LEAST_MAGNITUDE)
     unsure = sum(not mode.magnitude + mode.error <= least for mode in dead)
     if shown:
-        yield from table([HEADINGS, *map(_cells, shown)], "><>>><")
+        yield from table([HEADINGS, *map(_cells, shown)], "><>><")
         if any(PAST in _leading(mode) for mode in shown):
             yield from notes("(-T): value at T before the frame; sent(-T): value sent at that time")
     if delays:
@@ -380,9 +381,8 @@ def _cells(mode: Mode) -> tuple[str, ...]:
     """Return the cells of a mode's row, in the order of `HEADINGS`."""
     return (
         _magnitude(mode),
-        mode.family,
-        str(mode.multiplicity),
-        in_hertz(mode.frequency_hz) if mode.frequency_hz else "real",
+        mode.family + (f" × {mode.multiplicity:,}" if mode.multiplicity > 1 else ""),
+        in_hertz(mode.frequency_hz).removesuffix(" Hz") if mode.frequency_hz else "real",
         "–" if math.isnan(mode.damping_ratio) or not mode.frequency_hz else f"{mode.damping_ratio + 0.0:.3g}",
         _leading(mode),
     )
@@ -401,7 +401,7 @@ def _magnitude(mode: Mode) -> str:
 
 def _leading(mode: Mode) -> str:
     name, share = max(mode.participation, key=lambda item: item[1], default=("", 0.0))
-    return f"{name} {share:.0%}" if share >= LEAST_SHARE else ""
+    return f"{name} {100 * share:.0f}" if share >= LEAST_SHARE else ""
 
 
 def model_size_text(model_size: ModelSize) -> Lines:
@@ -448,22 +448,22 @@ def box_proof_text(box_proof: RobustStability) -> Lines:
     if box_proof.stable is not None:
         whole = f"proved {box_proof.verdict} for every value in the box ({cells})"
         printed = whole if box_proof.stable else "not stable in the entire box"
-    yield f"{box_proof.topology}:"
-    for text in (*box_proof.limitations, printed):
-        yield from wrapped(text)
+    yield from wrapped(f"{box_proof.topology}: {printed}", "", "  ")
+    yield from notes(*box_proof.limitations)
+    yield ""
     yield from (f"  {range_text(interval)}" for interval in box_proof.ranges)
     if box_proof.stable is False:
-        yield f"proved {box_proof.verdict} at"
-        yield from where
+        yield f"  proved {box_proof.verdict} at"
+        yield from (f"  {text}" for text in where)
     elif (
         box_proof.stable is None and box_proof.counterexample
     ):  # otherwise there was no search, as its notes explain
-        yield "undecided, among others, near"
-        yield from where
-        yield from wrapped(f"Try more cells: --cells {MORE_CELLS * box_proof.cells}")
+        yield "  undecided, among others, near"
+        yield from (f"  {text}" for text in where)
+        yield from sentences(f"Try more cells: --cells {MORE_CELLS * box_proof.cells}")
     if box_proof.changing is not None:
         yield ""
-        yield from wrapped(changing_text(box_proof.changing, box_proof.ranges[0]))
+        yield from sentences(changing_text(box_proof.changing, box_proof.ranges[0]))
     yield from notes(*box_proof.notes)
 
 
@@ -473,7 +473,8 @@ def changing_text(changing: ChangingDelay, over: Range) -> str:
     printed = [changing.note or "stability is undecided"]
     if changing.unstable is not None:
         first, second = changing.unstable
-        printed = [f"unstable if {first} packets with {low} and {second} packets with {high} alternate"]
+        packets = f"{counted(first, 'packet')} with {low} and {counted(second, 'packet')} with {high}"
+        printed = [f"unstable if {packets} alternate"]
     if changing.proved_to == float(over.high):
         printed = ["stable, proved by the small gain theorem"]
     elif changing.proved_to is not None:
@@ -570,18 +571,21 @@ def analysis_picture(result: Analysis, ax: Any = None) -> Any:
     ApcError
         E875 matplotlib is not installed.
     """
-    ax = _circle(ax)
-    modes = [mode for mode in result.modes if mode.eigenvalue.imag >= 0]  # of a pair one
+    own, ax = ax is None, _circle(ax)
+    modes = [mode for mode in result.modes if mode.eigenvalue.imag >= -mode.error]  # of a pair one
     rest = [mode.eigenvalue for mode in modes[MOST_NAMED:]]
     for index, mode in enumerate(modes[:MOST_NAMED]):
         times = f" × {mode.multiplicity}" if mode.multiplicity > 1 else ""
-        label = f"{mode.magnitude:.4f}{times}, {in_hertz(mode.frequency_hz)}, {mode.family}"
+        turns = in_hertz(mode.frequency_hz) if mode.frequency_hz else "real"
+        label = f"{mode.magnitude:.4f}, {turns}, {mode.family}{times}"
         _mark(ax, mode.eigenvalue, MARKS[index % len(MARKS)], COLOURS[1 + index], label)
     _mark(ax, rest, ".", "0.4", f"{len(rest)} faster modes")
     seconds = result.settling_s
-    settles = "" if seconds is None else f"; settling time (2 %) {seconds:.3g} s"
+    settles = "" if seconds is None else f"; settling time (2 %) {quantity(seconds, 's', 3)}"
     radius = f"spectral radius {result.spectral_radius:.6g} per frame of {1e3 * result.frame_s:g} ms{settles}"
     _entitle(ax, [f"{result.topology}: {result.verdict}", radius])
+    if own:
+        notes_below(ax.figure, [str(note) for note in result.limitations])
     return ax
 
 

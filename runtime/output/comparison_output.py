@@ -91,7 +91,7 @@ def comparison_text(comparison: SchemeComparison) -> Lines:
         "<<>",
     )
     verdicts = [_verdict(scheme, feet) for scheme in schemes]
-    yield from _scheme_table("Stability", ("verdict", "spectral radius per frame", "settling time"), verdicts)
+    yield from _scheme_table("Stability", ("verdict", "radius per frame", "settling time"), verdicts)
     if any(scheme.linearized for scheme in schemes):
         rows = [_in_time(scheme, feet) for scheme in schemes]
         yield from _scheme_table("Simulation", ("verdict", "duration"), rows)
@@ -138,7 +138,7 @@ def _meant(comparison: SchemeComparison) -> Iterator[str]:
     if any(scheme.passive for scheme in comparison.schemes):
         yield MEANT["passive"]
     elif any(reached(scheme, f"{key}.criterion") in MEANT for scheme in comparison.schemes for key in VARIED):
-        yield "Criterion for unreliable links: mean-square stability over the lossy network"
+        yield "criterion for unreliable links: mean-square stability over the lossy network"
 
 
 def _why(scheme: Scheme, key: str) -> tuple[str, ...]:
@@ -155,8 +155,8 @@ def _verdict(scheme: Scheme, feet: dict[str, int]) -> tuple[str, str, str]:
         root, error = math.sqrt(scheme.network.mean_square_radius), scheme.network.error or 0.0
         grown = radius_text(root, error / (2 * root) if root else error)
         texts.append(
-            "the spectral radius is that of the nominal network; the square root of the second-moment growth "
-            f"is {grown} per frame"
+            "spectral radius and settling time are those of the nominal network; the square root of the "
+            f"second-moment growth is {grown} per frame"
         )
     if scheme.passive is not None:
         texts.append("the spectral radius is that with free devices")

@@ -2,8 +2,8 @@
 
 Takes: frozen values, texts.
 Gives: `Plain`, `document`, `record`, `picked`, `reached`, `json_text`; `full_digits`, `radius_text`,
-`quantity`, `with_error`, `uncertain`, `span`, `axis_label`, `listed`, `point_text`; `Lines`, `notes`,
-`sentences`, `labelled`, `headed`, `table`; `MEANT`.
+`quantity`, `with_error`, `rounds_to`, `uncertain`, `span`, `axis_label`, `listed`, `point_text`,
+`capitalized`; `Lines`, `notes`, `sentences`, `labelled`, `headed`, `table`, `without_dashes`; `MEANT`, `JUMP`.
 Guarantees: a document is made of what JSON has words for; the same value gives the same text; a line is at
 most 80 columns wide where its words allow it.
 Does not: know a result.
@@ -12,8 +12,10 @@ Does not: know a result.
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import math
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextvars import ContextVar
 from dataclasses import fields, is_dataclass
@@ -33,6 +35,9 @@ MEANT = {
     "passive": "criterion: absolute stability with any passive operator at every device",
 }
 
+# The legend of a limit marked as a jump.
+JUMP = "jump: the spectral radius is discontinuous at this value"
+
 # Plain data, ready for JSON.
 Plain = dict[str, Any]
 
@@ -42,10 +47,15 @@ Lines = Iterator[str]
 # A number nearer to 1 is printed by its distance from 1, with this number of digits at most.
 NEAR, REPORTED = 1e-6, 1e-4
 
+NO_TEXT = "–"  # in the cell of a table
+
 LINEARIZED = ", linearized at the {}"
 
-# Significant digits of a number in text.
+# Significant digits of a number in text, and the largest number before a prefix of its unit.
 DIGITS = 6
+MOST = 10_000
+
+_NAME = re.compile(r"\w+[._\[]\w")  # at the start of a text
 
 _FULL: ContextVar[bool] = ContextVar("full_digits", default=False)
 
@@ -139,11 +149,16 @@ def radius_text(radius: float, error: float, radius_excess: tuple[float, float] 
 
 def quantity(value: float, unit: str, digits: int = 6) -> str:
     """Return an SI number with `digits` digits in its display unit."""
+    by, shown = _prefixed(value, unit)
+    return with_unit(f"{float(value * by):.{digits}g}", shown)
+
+
+def _prefixed(value: float, unit: str) -> tuple[Fraction, str]:
+    """Return the factor from SI to the display unit of a number, in kN above `MOST`, and that unit."""
     by, shown = as_shown(value, unit)
-    number = float(value * by)
-    if shown.startswith("N") and 10**digits <= abs(number) < math.inf:  # instead of an exponent
-        number, shown = number / 1000, f"k{shown}"
-    return with_unit(f"{number:.{digits}g}", shown)
+    if shown.startswith("N") and MOST < abs(value * by) < math.inf:
+        return by / 1000, f"k{shown}"
+    return by, shown
 
 
 @contextlib.contextmanager
@@ -165,9 +180,14 @@ def with_error(value: float, error: float, unit: str = "1") -> str:
         The number and the bound of its error, both in `unit`.
     """
     shown = f"{value:.{DIGITS}g}"
-    if _FULL.get() or not (math.isfinite(value) and value and error <= _half_digit(shown)):
+    if _FULL.get() or not rounds_to(value, error):
         return measured(value, error, unit)
     return with_unit(shown, unit)
+
+
+def rounds_to(value: float, error: float) -> bool:
+    """Return whether the error of a number is within half a unit of its last printed digit."""
+    return bool(math.isfinite(value) and value and error <= _half_digit(f"{value:.{DIGITS}g}"))
 
 
 def _half_digit(shown: str) -> float:
@@ -183,8 +203,8 @@ def uncertain(value: float, error: float, unit: str) -> str:
 
 def span(low: float, high: float, unit: str) -> str:
     """Return a range between two numbers in SI, with one unit; format as in `quantity`."""
-    by, shown = as_shown(max(abs(low), abs(high)), unit)
-    return with_unit(f"{low * by:.6g} to {high * by:.6g}", shown)
+    by, shown = _prefixed(max(abs(low), abs(high)), unit)
+    return with_unit(f"{float(low * by):.6g} to {float(high * by):.6g}", shown)
 
 
 def axis_label(name: str, unit: str) -> str:
@@ -200,6 +220,11 @@ def point_text(linearized: bool, at_equilibrium: bool) -> str:
 def listed(names: Sequence[str], most: int = 6) -> str:
     """Return the first names of several, and "…" for the others; "none" where there are none."""
     return ", ".join([*names[:most], *["…"][: max(len(names) - most, 0)]]) or "none"
+
+
+def capitalized(text: str) -> str:
+    """Return a text with a capital letter; a name such as device.mass stays as it is."""
+    return text if _NAME.match(text) else text[:1].upper() + text[1:]
 
 
 def notes(*texts: Note) -> Lines:
@@ -229,6 +254,24 @@ def labelled(*rows: tuple[str, str], width: int = 20) -> Lines:
     for label, text in rows:
         if text:
             yield from wrapped(text, f"  {label:<{width}}", " " * (width + 2))
+
+
+def without_dashes(rows: Sequence[Sequence[str]], sides: str) -> tuple[list[tuple[str, ...]], str]:
+    """Return rows of cells and their alignment without the columns that have no text in any row.
+
+    Parameters
+    ----------
+    rows
+        The cells; the headings are the first row.
+    sides
+        The alignment `<` or `>` of each column.
+    """
+    kept = [not set(cells) <= {NO_TEXT, ""} for _, *cells in zip(*rows, strict=True)]
+    kept = kept if len(rows) > 1 else [True] * len(kept)
+    return (
+        [tuple(itertools.compress(row, kept)) for row in rows],
+        "".join(itertools.compress(sides, kept)),
+    )
 
 
 def table(rows: Sequence[Sequence[str]], sides: str = "", *, later: int | None = None) -> Lines:

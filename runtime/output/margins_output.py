@@ -12,7 +12,18 @@ import itertools
 from typing import TYPE_CHECKING
 
 from apc.compiler.wording import in_hertz
-from apc.output.formatting import Lines, Plain, document, headed, notes, quantity, table, with_error
+from apc.output.formatting import (
+    JUMP,
+    Lines,
+    Plain,
+    document,
+    headed,
+    notes,
+    quantity,
+    table,
+    with_error,
+    without_dashes,
+)
 from apc.parameter_values.display_units import as_shown
 
 if TYPE_CHECKING:
@@ -35,10 +46,10 @@ def margins_text(margins: Margins) -> Lines:
 
 def margins_lines(margins: Margins) -> Lines:
     """Yield the table of the margins below its title and an empty line."""
-    return headed("Stability margins (one parameter at a time, the others unchanged)", _margin_table(margins))
+    return headed("Stability margins (one parameter at a time, the others unchanged)", margins_table(margins))
 
 
-def _margin_table(margins: Margins) -> Lines:
+def margins_table(margins: Margins) -> Lines:
     """Yield the table of the margins, a row for each parameter, and the reasons for those not searched."""
     rows = [("parameter", "value", "stable up to", "ratio", "f [Hz]")]
     skipped: dict[str, list[str]] = {}
@@ -59,7 +70,8 @@ def _margin_table(margins: Margins) -> Lines:
             limit, ratio, frequency = f"no limit up to {quantity(row.searched_to, row.unit, 5)}", "", ""
         rows.append((row.parameter, quantity(row.current, row.unit, 5), limit, ratio, frequency))
     if len(rows) > 1:
-        yield from table(rows, "<<<>>")
+        yield from table(*without_dashes(rows, "<<<>>"))
+        yield from notes(JUMP if any(row.kind == "jump" for row in margins.rows) else "")
     reasons = (f"not searched: {', '.join(names)}: {why}" for why, names in skipped.items())
     yield from notes(*reasons, *margins.note.splitlines())
 

@@ -21,8 +21,11 @@ if TYPE_CHECKING:
     from apc.mean_square.mean_square_stability import MeanSquareStability
     from apc.network.link_fit import LinkFit, Share
 
+MEDIAN = 0.5
+
 _WORDS = {
-    True: "With the packet losses and delays of the network, the second moments of all motions decay{}.",
+    True: "With the packet losses and delays of the network, the second moments of all motions decay, "
+    "apart from common translations if they are free.",
     False: "With the packet losses and delays of the network, the second moment of some motion grows.",
     None: "The second-moment growth is closer to 1 than its error bound.",
 }
@@ -36,7 +39,7 @@ def network_text(result: MeanSquareStability) -> Lines:
     yield f"{result.topology}: {result.verdict}{where}{point}"
     yield ""
     if radius is not None:
-        yield from sentences(_WORDS[result.stable].format(", apart from free common translations"))
+        yield from sentences(_WORDS[result.stable])
         yield ""
         error, root = result.error or 0.0, math.sqrt(radius)
         rooted = radius_text(root, error / (2 * root) if root else error)
@@ -97,7 +100,8 @@ def recording_text(recording: LinkFit) -> Lines:
         several = recording.packets > recording.lost.count + 1
         spread = f", standard deviation {_ms(recording.std)}" if several else ""
         quantiles = (
-            (f"  {100 * share:g} %", f"at most {_ms(delay)}") for share, delay in recording.quantiles
+            (_quantile(share), f"{'' if share == MEDIAN else 'at most '}{_ms(delay)}")
+            for share, delay in recording.quantiles
         )
         span = f"{_ms(recording.shortest)} to {_ms(recording.longest)}"
         yield from labelled(("delay", span), ("  mean", f"{_ms(recording.mean)}{spread}"), *quantiles)
@@ -109,6 +113,11 @@ def recording_text(recording: LinkFit) -> Lines:
         away = f"the distribution functions differ by at most {100 * recording.distribution.distance:.2g} %"
         yield from notes(f"best fit: {recording.distribution.distribution}; {away}")
     yield from ("", "Link with the recorded packets", "", f"  lan: {{clock: network, trace: {file}}}")
+
+
+def _quantile(share: float) -> str:
+    """Return the label of a quantile of delays."""
+    return "  median" if share == MEDIAN else f"  {100 * share:g} %"
 
 
 def recording_document(recording: LinkFit) -> Plain:

@@ -12,10 +12,12 @@ from collections import Counter
 from decimal import ROUND_CEILING, ROUND_FLOOR, Context, Decimal
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.wording import counted, in_hertz, with_unit, wrapped
 from apc.output.formatting import (
+    JUMP,
     MEANT,
     Lines,
     Plain,
@@ -23,10 +25,12 @@ from apc.output.formatting import (
     notes,
     quantity,
     record,
+    rounds_to,
     sentences,
     span,
     table,
     uncertain,
+    without_dashes,
 )
 from apc.parameter_values.display_units import as_shown
 from apc.studies.crossing import PERIOD
@@ -66,7 +70,9 @@ def critical_text(critical: Critical) -> Lines:
         for crossing in critical.crossings:
             value = uncertain(crossing.value, crossing.error, unit)
             rows.append((value, _sides(crossing), in_hertz(crossing.frequency_hz), str(crossing.proof)))
-        yield from table(rows, "<<><")
+        yield from table(*without_dashes(rows, "<<><"))
+        if any(crossing.kind == "jump" for crossing in critical.crossings):
+            yield from sentences(JUMP)
         yield ""
     yield from sentences(f"current value: {_present_value(critical)}")
     if not critical.has_effect or critical.counted:
@@ -110,23 +116,27 @@ def _present_value(critical: Critical) -> str:
 
 def _stable_ranges(critical: Critical) -> str:
     """Return the stable range of a model in a sentence; empty without a crossing."""
-    ranges, begin, included, least = [], "", None, -math.inf
+    ranges, begin, included, after, least = [], "", None, "from", -math.inf
     for crossing in critical.crossings:
         if critical.counted:
             value = f"{math.floor(crossing.boundary) + (crossing.stable_side == 'above'):,d}"
         else:
             by, shown = as_shown(crossing.value, critical.unit)
-            error = 0.0 if crossing.stable_at else crossing.error * by
-            value = with_unit(f"{_on_stable_side(crossing.value * by, error, crossing.stable_side):g}", shown)
+            error = 0.0 if crossing.stable_at else float(crossing.error * by)
+            number = float(crossing.value * by)
+            if not rounds_to(number, error):  # otherwise the same digits as in the table
+                number = _on_stable_side(number, error, crossing.stable_side)
+            value = with_unit(f"{number:.{SHOWN}g}", shown)
         if crossing.stable_side == "above":
             begin, included = value, critical.counted or crossing.stable_at
+            after = "above" if crossing.kind == "jump" and crossing.stable_at is False else "from"
             least = crossing.value + crossing.error
             continue
         if begin and not critical.counted and crossing.value - crossing.error <= least + 1e-9 * abs(least):
             begin = ""  # stable at a single value
             continue
         most = f"up to {value}" if critical.counted or crossing.stable_at else f"below {value}"
-        ranges.append(f"from {begin} {most}" if begin else most)
+        ranges.append(f"{after} {begin} {most}" if begin else most)
         begin = ""
     ranges += [f"from {begin} on" if included else f"above {begin}"] if begin else []
     return f"stable with {critical.parameter} {', and '.join(ranges)}" if ranges else ""
@@ -236,8 +246,9 @@ def _analyses_columns(analyses: Analyses) -> dict[str, NDArray[Any]]:
 
 def _verdict_lines(verdicts: Counter[str], messages: Counter[str]) -> Lines:
     """Yield the number of points with each verdict, and the most frequent error."""
-    for verdict, count in sorted(verdicts.items(), key=lambda item: (-item[1], item[0])):
-        yield f"  {count:>10,} × {verdict}"
+    ordered = sorted(verdicts.items(), key=lambda item: (-item[1], item[0]))
+    yield ""
+    yield from table([("points", "verdict"), *((f"{count:,}", verdict) for verdict, count in ordered)], "><")
     counter = Counter({text: count for text, count in messages.items() if text})
     for text, count in counter.most_common(1):
         yield from notes(f"at {count:,} of them: {text}")
@@ -251,8 +262,20 @@ def sweep_text(sweep: Sweep) -> Lines:
     for axis in sweep.grid.axes:
         ends = span(float(axis.values[0]), float(axis.values[-1]), axis.unit)
         yield f"  {axis.free.label}: {ends}, {counted(len(axis.values), 'value')}"
+    yield from _result_range(sweep)
     yield from _verdict_lines(sweep.counts, sweep.messages)
     yield from (f"  note: {note}" for note in sweep.notes)
+
+
+def _result_range(sweep: Sweep) -> Lines:
+    """Yield the smallest and largest result of a sweep, after its verdict the first column of numbers."""
+    heading = sweep.headings[len(sweep.grid.axes) + 1]
+    if sweep.held is None and (sweep.out is None or not sweep.out.is_file()):
+        return  # written to a pipe
+    values = sweep.column(heading)
+    known = values[np.isfinite(values)] if values.dtype == np.float64 else values[:0]
+    if known.size:
+        yield f"  {heading}: {known.min():.6g} to {known.max():.6g}"
 
 
 def sweep_document(sweep: Sweep) -> Plain:

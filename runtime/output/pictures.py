@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any
 from apc.compiler.errors import ApcError
 from apc.compiler.files import check_target, write_file, write_text
 from apc.compiler.timings import part
-from apc.output.formatting import json_text
+from apc.output.formatting import capitalized, json_text
 from apc.parameter_values.display_units import as_shown
 from apc.support.distribution import program_version
 from apc.support.optional import need
@@ -90,7 +90,7 @@ def short_legend(handles: Sequence[Any], labels: Sequence[str], of: int = 0) -> 
 def notes_below(figure: Any, texts: Sequence[str]) -> None:
     """Put notes below all panels of a figure, each once, wrapped to its width."""
     letters = int(13 * figure.get_figwidth())
-    sentences = [text[:1].upper() + text[1:] for text in dict.fromkeys(texts)]
+    sentences = [capitalized(text) for text in dict.fromkeys(texts)]
     lines = [line for text in sentences for line in textwrap.wrap(text, letters)]
     if lines:
         style = {"x": 0.01, "ha": "left", "fontsize": 7.5, "color": "0.3", "gid": NOTES}

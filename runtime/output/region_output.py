@@ -28,7 +28,6 @@ from apc.output.formatting import (
     sentences,
     span,
     table,
-    with_error,
 )
 from apc.output.region_picture import panel_letter, panels_picture, region_picture  # noqa: F401 -- looked up
 from apc.parameter_values.display_units import as_shown
@@ -43,6 +42,11 @@ Floats = NDArray[np.float64]
 # Curves listed; of a boundary with more curves only the number is printed.
 MOST_CURVES = 12
 
+# A coordinate, relative to the side of the rectangle, and a frequency in Hz, below which zero is printed.
+LEAST_SHARE, LEAST_HZ = 1e-6, 1e-6
+
+ERROR = "error: relative to each coordinate of the curve"
+
 
 def region_text(region: Region) -> Lines:
     """Yield the output of `apc region` for one region."""
@@ -52,25 +56,28 @@ def region_text(region: Region) -> Lines:
     ]
     off, percent = region.stable_area_error, 100 / float(region.rectangle.width.prod())
     share = known_digits(percent * region.stable_area, percent * off, 4)
-    area = with_error(region.stable_area, off, _product(region.x.unit, region.y.unit))
     yield f"{region.topology}: {_words(region)}"
     yield from notes(MEANT.get(region.criterion, ""), *region.limitations)
     yield ""
     yield from table([("axis", "parameter", "range"), *axes])
     yield ""
-    yield from labelled(("stable area", f"{share} % of the rectangle ({area})"))
+    yield from labelled(("stable area", f"{share} % of the rectangle"))
     if region.curves:
-        rows = [("mode", "frequency [Hz]", "from (x, y)", "to (x, y)", "rel. error")]
-        curves = [*rows, *(_row(region, curve) for curve in region.curves[:MOST_CURVES])]
-        yield from headed("Boundary curves", table(curves))
-        left = len(region.curves) - MOST_CURVES
+        rows = [("mode", "f [Hz]", "from (x, y)", "to (x, y)", "error")]
+        shown = [curve for curve in region.curves if not _is_point(region, curve)][:MOST_CURVES]
+        curves = [*rows, *(_row(region, curve) for curve in shown)]
+        if not any(_is_modal(curve) for curve in region.curves):
+            curves = [cells[2:] for cells in curves]
+        yield from headed("Boundary curves", table(curves, "<" * len(curves[0])))
+        yield from notes(ERROR)
+        left = len(region.curves) - len(shown)
         if left > 0:
-            yield f"  {left} more curves not shown (--json)"
+            yield f"  {counted(left, 'more curve')} not shown (--json)"
     if coarse := region.coarse:
         most, many = max(curve.error for curve in coarse), counted(len(coarse), "curve")
         yield ""
         yield from sentences(
-            f"relative error of {many}: {most:.0e}, above the requested {region.tolerance:.0e}"
+            f"relative error of {many}: up to {most:.0e}, above the requested {region.tolerance:.0e}"
         )
     sizes = zip(region.cell, (region.x, region.y), strict=True)
     cell = " × ".join(quantity(size, axis.unit, 4) for size, axis in sizes)
@@ -97,7 +104,8 @@ def _words(region: Region) -> str:
 
 
 def _row(region: Region, curve: Curve) -> tuple[str, ...]:
-    low, high = (f"{value:.4g}" for value in curve.frequency_hz)
+    low, high = (f"{value if value > LEAST_HZ else 0.0:.4g}" for value in curve.frequency_hz)
+    low = "nan" if np.isnan(curve.frequency_hz[0]) else low
     frequency = "–" if low == "nan" else low if low == high else f"{low} to {high}"
     end = "closed" if curve.closed else _point(region, curve, -1)
     return f"{curve.mode:.11}", frequency, _point(region, curve, 0), end, f"{curve.error:.0e}"
@@ -105,10 +113,22 @@ def _row(region: Region, curve: Curve) -> tuple[str, ...]:
 
 def _point(region: Region, curve: Curve, index: int) -> str:
     """Return a point of a curve in the units of the axes; its error is relative to each coordinate."""
-    by = [float(as_shown(float(axis.high), axis.unit)[0]) for axis in (region.x, region.y)]
-    return "({}, {})".format(
-        *(known_digits(point, curve.error * abs(point), 6) for point in curve.points[index] * by)
-    )
+    numbers = []
+    for value, axis in zip(curve.points[index].tolist(), (region.x, region.y), strict=True):
+        by = float(as_shown(float(axis.high), axis.unit)[0])
+        value = value if abs(value) > LEAST_SHARE * float(axis.high - axis.low) else 0.0
+        numbers.append(known_digits(value * by, curve.error * abs(value * by), 6))
+    return f"({', '.join(numbers)})"
+
+
+def _is_modal(curve: Curve) -> bool:
+    """Return whether a curve is the stability boundary of a mode, not of second moments or passivity."""
+    return not np.isnan(curve.frequency_hz[0])
+
+
+def _is_point(region: Region, curve: Curve) -> bool:
+    """Return whether a curve is shorter than `LEAST_SHARE` of each side of the rectangle."""
+    return bool(np.all(np.ptp(region.rectangle.points(curve.points), axis=0) < LEAST_SHARE))
 
 
 def region_document(region: Region) -> Plain:

@@ -56,7 +56,7 @@ def report_text(report: Report) -> Lines:
             yield ""
         yield topology.name
         for section in topology.sections:
-            yield from notes(f"{TITLES[section.key]}: {section.refused or f'as {section.command}'}")
+            yield from notes(f"{TITLES[section.key]}: {section.refused or section.command}")
 
 
 def report_document(report: Report) -> Plain:

@@ -80,9 +80,10 @@ def tuning_text(tuning: Tuning) -> Lines:
     value = uncertain(tuning.optimum, tuning.error, tuning.unit)
     if _is_transparency(tuning) or math.isinf(tuning.error):  # nobody knows how far any better one may be
         value = quantity(tuning.optimum, tuning.unit, SHADOW_PRICES + 1)
+    of = f"{_radius(tuning)} " if tuning.objective in (RADIUS, SETTLING) else ""
     better = f"within {100 * float(OPTIMALITY_GAP):.3g} % of the global optimum"
     yield from labelled(
-        ("optimum", f"{value} ({tuning.evaluations:,} evaluations)" if tuning.feasible else ""),
+        ("optimum", f"{of}{value} ({tuning.evaluations:,} evaluations)" if tuning.feasible else ""),
         ("global bound", f"{better}, proved in {tuning.bound_cells:,} cells" if tuning.bound_cells else ""),
         ("margin", _margin(tuning) if tuning.feasible else ""),
     )
@@ -120,7 +121,7 @@ def _sentence(tuning: Tuning) -> str:
         settled = tuning.frame_s * power * math.log(SETTLED) / math.log(tuning.value)
         time = f"settling time (to {100 * SETTLED:.0f} %) {quantity(settled, 's', 3)}{over}"
         least = f"{_radius(tuning)} below {tuning.value:.6g}, close to the smallest found"
-        return f"{tuning.topology}: {time}, {least}; stability {proved}"
+        return f"{tuning.topology}: {time}, {least}; {proved}"
     value = f"{quantity(tuning.value, tuning.unit, TYPED)} is the {best} {tuning.objective}"
     return f"{tuning.topology}: {value} found for which {stable}{over}; {proved}"
 
@@ -203,14 +204,15 @@ def _active_lines(tuning: Tuning, binding: ActiveConstraint) -> Lines:
     mode = f"{binding.family} mode" if binding.family else "" if math.isnan(binding.frequency_hz) else other
     if not mode and tuning.demanded and not tuning.transparency_metrics:
         mode = "bound for a delay that varies from packet to packet"
-    mode += f" at {in_hertz(binding.frequency_hz)}" if mode and not math.isnan(binding.frequency_hz) else ""
-    yield from wrapped(": ".join(filter(None, [_where(binding), mode])) or other, "    ", "      ")
+    if mode and not math.isnan(binding.frequency_hz):
+        mode += f" at {in_hertz(binding.frequency_hz)}" if binding.frequency_hz else ", real eigenvalue"
+    yield from wrapped(": ".join(filter(None, [_where(binding), mode])) or other, "  ", "    ")
     for label, value, unit, better in (
         binding.shadow_prices if tuning.feasible and tuning.objective not in (RADIUS, SETTLING) else ()
     ):
         shadow_prices = quantity(better, tuning.unit, SHADOW_PRICES)
         text = f"relaxing {label} = {quantity(value, unit)} by 1 % changes the optimum by {shadow_prices}"
-        yield from wrapped(text, "      ", "        ")
+        yield from wrapped(text, "    ", "      ")
 
 
 def panels_of(system: Model, gains: int) -> tuple[bool, bool]:
@@ -305,9 +307,9 @@ def _draw_impulse_response(tuning: Tuning, ax: Any) -> None:
     least, most = ax.get_ylim()  # diverging curves are cut off
     ax.set_ylim(max(least, 3 * low - 2 * high), min(most, 3 * high - 2 * low))
     where = f", {_where(tuning.active[0])}" if tuning.active and _where(tuning.active[0]) else ""
-    ax.set_title("\n".join(textwrap.wrap(f"impulse response of {name}{where}", 60)), fontsize=9)
+    ax.set_title("\n".join(textwrap.wrap(f"Impulse response of {name}{where}", 60)), fontsize=9)
     ax.set(xlabel="time [s]", ylabel=f"{simulated.signals[index].local} [mm]")
-    ax.legend(frameon=False, fontsize=8)
+    legend_below(ax)
     ax.grid(linewidth=0.4, alpha=0.5)
 
 

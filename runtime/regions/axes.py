@@ -53,7 +53,7 @@ def parse_axes(
             unit = unit_of(system, local.parameter)
             text = f"{local.parameter}={float(local.low)!r} {unit}:{float(local.high)!r} {unit}"
         if text is None:
-            message = f"--{letter} is missing, and the topology has no studies: region:"
+            message = f"--{letter} is missing, and the topology has no studies.region"
             given_axis = (y if letter == "x" else x) or ""
             other = given_axis.partition("=")[0].strip()
             fix = f'--{letter} "{proposed_range(system, without=other)}"'

@@ -266,9 +266,7 @@ def _region(system: Model, call: str) -> Section:
             if unit_of(system, parameter_ref.name) in STIFFNESSES
         ]
         if len(stiff) < 2:
-            why = (
-                "fewer than two stiffnesses are common to all peers, and the topology has no studies: region:"
-            )
+            why = "fewer than two stiffnesses are common to all peers; the topology has no studies.region"
             return Section("region", "", refused=why)
         axis_texts = [
             f"{parameter_ref.label}=0 N/m:{FURTHER * parameter_of(system, parameter_ref).value or 1000:g} N/m"

@@ -64,7 +64,7 @@ BACK_IN_BOX = (5e-3, 1e-2)
 SLACK = 1e-5
 
 # The text if only stability is proved.
-SLOWER = "stability is proved; decay and metrics are evaluated for each scenario only"
+SLOWER = "decay and metrics, evaluated for each scenario only; stability is proved"
 
 # Text for the demand of every passive hand in a box.
 POINTWISE = "no box is proved with passive hands; the scenarios were evaluated"

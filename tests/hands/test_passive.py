@@ -165,7 +165,7 @@ def by_critical(system: Model, limit: float) -> None:
     (crossing,) = apc.critical(system, PULL, criterion="passive").crossings
     assert crossing.value == pytest.approx(limit, rel=5e-7)
     assert crossing.error < 3e-9 * limit
-    assert str(crossing.proof) == "passivity bounded on both sides"
+    assert str(crossing.proof) == "rigorous passivity bounds"
 
 
 def by_certificate(system: Model, limit: float) -> None:

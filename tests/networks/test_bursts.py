@@ -71,7 +71,7 @@ def test_of_many_peers_it_is_an_estimate_that_says_so(
 @pytest.mark.parametrize(
     ("loss", "proof"),
     [
-        ("10 %", "second moments bounded on both sides"),
+        ("10 %", "rigorous second-moment bounds"),
         ("{p: 1 %, r: 10 %}", "second moments by floating-point iteration, not proved"),
     ],
 )

@@ -135,4 +135,4 @@ def test_a_force_moves_all_that_is_rigidly_connected_with_a_device() -> None:
 def test_where_there_is_none_it_says_why(change: tuple[str, str], why: str) -> None:
     found = decided(replaced(topology(3, 500.0), change))
     assert found.rms_error_m is None
-    assert f"root mean square error of copies: {why}" in found.notes
+    assert f"coordination error not available: {why}" in found.notes

@@ -55,7 +55,7 @@ def test_many_recorded_delays_are_told_with_how_they_were_found_and_too_many_are
     assert found.mean_square_radius == pytest.approx(NOMINAL["8"] ** 2, rel=1e-3)
     assert any("1,000 frames" in note for note in found.notes)
     assert found.rms_error_m is None
-    assert "root mean square error of copies: it is not computed for recorded delays" in found.notes
+    assert "coordination error not available: it is not computed for recorded delays" in found.notes
     found = decided(tmp_path, "8\n9\n" * 10_001)
     assert found.verdict == "not judged" and "20,002 frames" in found.notes[0]
 

@@ -7,12 +7,15 @@ import re
 from fractions import Fraction
 from math import floor, log10
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from apc.output.formatting import full_digits, with_error
+from apc.analysis.box_result import ChangingDelay
+from apc.output.analysis_output import changing_text
+from apc.output.formatting import capitalized, full_digits, quantity, span, with_error, without_dashes
 from tests.commands import Cli
 from tests.topologies import TOPOLOGIES
 
@@ -97,3 +100,70 @@ def test_past_values_among_the_participations_have_a_legend(name: str, has_legen
     text = cli(f"analyze --no-margins {TOPOLOGIES / name}.yaml").out.partition("Modes (")[2]
     table, legend, _ = text.partition(f"  {LEGEND}\n")
     assert (bool(legend), bool(re.search(r"\(-\d", table))) == (has_legend, has_legend)
+
+
+@pytest.mark.parametrize("words", ["", "--hands passive"])
+@pytest.mark.parametrize("name", ["three-users-average", "teleoperation-pair"])
+def test_a_critical_value_is_the_same_in_the_sentence_and_in_the_table(
+    name: str, words: str, cli: Cli
+) -> None:
+    out = cli(f"critical coordination.stiffness {TOPOLOGIES / name}.yaml {words}").out
+    stated, printed = re.search(r"below (\S+) N/m", out), re.search(r"^  (\S+) N/m +below", out, re.MULTILINE)
+    assert stated and printed and stated[1] == printed[1]
+    assert ("frequency" in out) == (not words)
+
+
+def test_a_column_without_any_text_is_omitted() -> None:
+    rows = [("parameter", "limit", "f [Hz]"), ("a", "1", "–"), ("b", "2", "")]
+    assert without_dashes(rows, "<<>") == ([("parameter", "limit"), ("a", "1"), ("b", "2")], "<<")
+    kept = [*rows, ("c", "3", "4")]
+    assert without_dashes(kept, "<<>") == (kept, "<<>")
+    assert without_dashes(rows[:1], "<<>") == (rows[:1], "<<>")
+
+
+@pytest.mark.parametrize(
+    ("value", "unit", "text"),
+    [
+        (9999.5, "N/m", "9999.5 N/m"),
+        (10_000, "N/m", "10000 N/m"),
+        (5e5, "N/m", "500 kN/m"),
+        (2e4, "kg", "20000 kg"),
+    ],
+)
+def test_forces_above_ten_thousand_have_a_prefix(value: float, unit: str, text: str) -> None:
+    assert quantity(value, unit) == text
+    assert span(0, value, unit) == f"0 to {text}"
+
+
+def test_a_mode_has_one_row_of_the_table(cli: Cli) -> None:
+    for name in ("three-users-average", "teleoperation-pair"):
+        text = cli(f"analyze --no-margins {TOPOLOGIES / name}.yaml").out.partition("Modes (")[2]
+        rows = text.partition("participation [%]\n")[2].partition("  (-T)")[0].splitlines()
+        assert rows and all(re.match(r" +[\d.]+  (\w| × )+ .* \d+$", row) for row in rows)
+
+
+def test_a_delay_that_alternates_between_single_packets_is_in_the_singular() -> None:
+    over = SimpleNamespace(low=Fraction(1, 100), high=Fraction(1, 50), unit="s")
+    text = changing_text(ChangingDelay(proved_to=None, unstable=(1, 2), note=""), over)  # type: ignore[arg-type]
+    assert "1 packet with 10 ms and 2 packets with 20 ms alternate" in text
+
+
+@pytest.mark.parametrize(
+    ("text", "printed"),
+    [
+        ("stable: hatched", "Stable: hatched"),
+        ("device.mass has one value", "device.mass has one value"),
+        ("", ""),
+    ],
+)
+def test_a_note_begins_with_a_capital_letter_unless_with_a_name(text: str, printed: str) -> None:
+    assert capitalized(text) == printed
+
+
+@pytest.mark.needs_extension("event_order")
+def test_orders_of_events_are_in_the_words_of_the_default_order(cli: Cli) -> None:
+    out = cli(f"analyze --no-margins --event-order {TOPOLOGIES / 'three-users-average.yaml'}").out
+    orders = out.partition("the verdict is the same")[2]
+    assert "such as: send, deliver, compute, apply" in orders
+    assert not re.search(r"\btick\b <|\bact\b", orders)
+    assert max(map(len, out.splitlines())) <= 80

@@ -142,7 +142,7 @@ def test_sections_that_a_topology_cannot_fill_say_why(cli: Cli) -> None:
     why = {one.key: one.refused for one in report.topologies[0].sections if one.refused}
     assert (
         why["region"]
-        == "fewer than two stiffnesses are common to all peers, and the topology has no studies: region:"
+        == "fewer than two stiffnesses are common to all peers; the topology has no studies.region"
     )
     assert why["network"] == "loss: there is no link"
     text = html.unescape(report_page(report))

@@ -61,6 +61,21 @@ def interrupted(target: Path, points: int = 128) -> list[Path]:
 # ---- the rows ----
 
 
+def test_the_text_has_the_range_of_the_results_and_the_points_of_each_verdict() -> None:
+    """The limits are those of an analysis of each point alone."""
+    found = apc.sweep(
+        compiled(AVERAGE), {"device.mass": "0.1,0.2 kg"}, of="critical:coordination.stiffness", jobs=1
+    )
+    limits = [
+        apc.critical(
+            apc.set_parameters(compiled(AVERAGE), {"device.mass": mass}), "coordination.stiffness"
+        ).value
+        for mass in ("0.1 kg", "0.2 kg")
+    ]
+    assert f"  value [N/m]: {min(limits):.6g} to {max(limits):.6g}\n" in str(found)
+    assert str(found).endswith("  points  verdict\n       2  stable below the value")
+
+
 def test_every_row_is_the_analysis_of_its_point() -> None:
     found = apc.sweep(compiled(AVERAGE), {"contact.stiffness": "500,4000 N/m", "lan.delay": "0,8 ms"}, jobs=1)
     assert found.headings == (

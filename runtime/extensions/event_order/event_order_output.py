@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from apc.compiler.wording import wrapped
 from apc.output.analysis_output import refusable_record
 from apc.output.formatting import (
     Lines,
@@ -19,6 +20,10 @@ from apc.output.formatting import (
 
 if TYPE_CHECKING:
     from apc.extensions.event_order.coincident_events import EventOrder
+
+
+# The events in words, where their names are other words.
+EVENTS = {"tick": "compute", "act": "apply"}
 
 
 def event_order_text(event_order: EventOrder) -> Lines:
@@ -33,7 +38,8 @@ def event_order_text(event_order: EventOrder) -> Lines:
         headline = event_order.not_repeated
     elif event_order.flips:
         headline = "the verdict depends on the order of simultaneous events"
-    yield f"{event_order.topology}: {headline}\n"
+    yield from wrapped(f"{event_order.topology}: {headline}", "", "  ")
+    yield ""
     for number, outcome in enumerate(event_order.outcomes, 1):
         radius = radius_text(outcome.spectral_radius, outcome.spectral_radius_error, outcome.radius_excess)
         yield f"  {number}  {outcome.verdict or 'not analyzed'}"
@@ -41,7 +47,8 @@ def event_order_text(event_order: EventOrder) -> Lines:
         yield from (f"     {departure}" for departure in outcome.departures or (DEFAULT,))
         if outcome.start:
             yield f"     received before the first packet: {outcome.start}"
-        yield f"     {len(outcome.orders)} of {ORDERS} orders, such as {' < '.join(outcome.orders[0])}"
+        order = ", ".join(EVENTS.get(event, event) for event in outcome.orders[0])
+        yield f"     {len(outcome.orders)} of {ORDERS} orders, such as: {order}"
     if event_order.repeated and not event_order.start_matters:
         yield "\n  Values received before the first packet do not affect the verdict."
 
