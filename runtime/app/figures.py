@@ -8,18 +8,19 @@ Does not: compute, or handle sliders.
 
 from __future__ import annotations
 
+import math
 from html import escape
 from typing import Any
 
 import numpy as np
 from bokeh.models import (
+    BasicTickFormatter,
     ColumnDataSource,
     CustomJS,
     CustomJSTickFormatter,
     Div,
     FixedTicker,
     HoverTool,
-    LogTicker,
     Range1d,
     Slider,
     Toggle,
@@ -28,7 +29,7 @@ from bokeh.plotting import figure
 
 from apc.app.motion import MM, ROWS, AnimationFrames
 from apc.compiler.wording import counted
-from apc.output.formatting import Plain, axis_label
+from apc.output.formatting import Plain, axis_label, capitalized
 from apc.output.still_picture import THICKNESS
 
 # Colors that are distinct in print and for color-blind readers: Okabe and Ito, 2008; the lightest two are
@@ -44,6 +45,8 @@ HEIGHT = 330
 ROUND, BEYOND, ROOM = 1.12, 1.05, 0.1
 CIRCLE = np.exp(1j * np.linspace(0, 2 * np.pi, 241))
 
+# The ratio of the ends of a logarithmic axis below which 2 and 5 of each decade are labelled, too.
+DECADES = 100
 # The vertical distance of the bodies of a peer, relative to the distance between two peers.
 STAGGER = 0.3
 # Height of a line of names, and length of an orientation bar, in pixels.
@@ -146,7 +149,7 @@ class LiveText:
 
     def show_text(self, *lines: str) -> None:
         """Show lines of plain text."""
-        self.model.text = "".join(f"<p>{escape(line)}</p>" for line in lines)
+        self.model.text = "".join(f"<p>{escape(capitalized(line))}</p>" for line in lines)
 
     def verdict(self, result: Plain) -> None:
         """Show a verdict, the dominant mode, limitations and, collapsed, the output of `apc analyze`."""
@@ -154,7 +157,7 @@ class LiveText:
         self.model.text = (
             f"<p><strong class='{kind}'>{escape(result['verdict'])}</strong>, {result['measure']} "
             f"{result['radius']:.9g} per frame</p><p>{escape(result['limits'])}</p>"
-            + "".join(f"<p>{escape(item)}</p>" for item in result["notes"])
+            + "".join(f"<p>{escape(capitalized(item))}</p>" for item in result["notes"])
             + "<details><summary>All modes</summary>"
             f"<pre tabindex='0'>{escape(result['text'])}</pre></details>"
         )
@@ -165,7 +168,7 @@ class LiveText:
 
     def nothing(self, why: str) -> None:
         """Show the reason for a missing result."""
-        self.model.text = f"<p class='why'>{escape(why)}</p>"
+        self.model.text = f"<p class='why'>{escape(capitalized(why))}</p>"
 
 
 class RegionFigure:
@@ -357,8 +360,9 @@ class MotionFigure:
             "name",
             source=self.bodies,
             y_offset="above",
-            text_align="center",
+            text_align="left",
             text_baseline="bottom",
+            x_offset=8,
             text_font_size="11px",
             text_color=INK,
         )
@@ -430,7 +434,7 @@ class MotionFigure:
             "height": [2 * height if planar else 0.5 * (height > 0) for _, height in half],
             "name": labels if planar else [body.name for _, body in motion.bodies],
             # In a plane bodies may coincide; their names are shown on separate lines.
-            "above": [-8 - (LINE if planar else 0) * index for index in range(len(labels))],
+            "above": [-8 - LINE * index if planar else 7 for index in range(len(labels))],
             "colour": colours,
         }
         fixed = [position for _, position in motion.walls]
@@ -521,8 +525,11 @@ class TransparencyFigure:
             plot.add_tools(HoverTool(tooltips=[("Hz", "@frequency"), (column, f"@{column}")], mode="vline"))
         self.phase.yaxis.ticker = [-180, -90, 0, 90, 180]
         self.plot.visible = self.phase.visible = False
-        self.plot.yaxis.ticker = LogTicker(mantissas=[1, 2, 5])
-        self.plot.yaxis.minor_tick_line_color = None  # minor labels overlap in a range of less than a decade
+        self.frequencies, self.magnitudes = FixedTicker(), FixedTicker()
+        self.plot.yaxis.ticker = self.magnitudes
+        self.plot.xaxis.ticker = self.phase.xaxis.ticker = self.frequencies
+        for axis in (*self.plot.axis, *self.phase.xaxis):
+            axis.formatter = BasicTickFormatter(use_scientific=False)
         self.words = LiveText("transparency-words")
 
     def show(self, result: Plain) -> None:
@@ -534,6 +541,8 @@ class TransparencyFigure:
         smallest, largest = size[size > 0].min(initial=size.max()) or 1.0, size.max() or 1.0
         margin = max((largest / smallest) ** ROOM, 1 + ROOM)  # on a logarithmic axis
         self.plot.y_range.update(start=smallest / margin, end=largest * margin)
+        self.frequencies.ticks = decade_ticks(f[0], f[-1])
+        self.magnitudes.ticks = decade_ticks(smallest / margin, largest * margin)
         self.words.show_text(
             f"At {result['at']}: {size[0]:.4g} N·s/m at {f[0]:.3g} Hz,"
             f" {size[-1]:.4g} N·s/m at {f[-1]:.3g} Hz.",
@@ -545,6 +554,14 @@ class TransparencyFigure:
         self.plot.visible = self.phase.visible = False
         self.source.data = columns("frequency", "magnitude", "phase")
         self.words.nothing(why)
+
+
+def decade_ticks(low: float, high: float) -> list[float]:
+    """Return the labelled values of a logarithmic axis: 1, 2 and 5 of each decade, 1 of more than two."""
+    mantissas = (1, 2, 5) if high < DECADES * low else (1,)
+    powers = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
+    ticks = [float(f"{mantissa}e{power}") for power in powers for mantissa in mantissas]
+    return [tick for tick in ticks if low <= tick <= high]
 
 
 def columns(*names: str) -> dict[str, list[Any]]:

@@ -30,6 +30,7 @@ from apc.lifting.numeric_model import NumericModel, numeric_model
 from apc.linearization.evaluation_errors import finite_equations
 from apc.mean_square.mean_square_stability import mean_square_stability
 from apc.output.formatting import Plain
+from apc.output.margins_output import margins_table
 from apc.output.region_picture import plotted_points, stable_outlines
 from apc.parameter_values.overrides import Override, apply
 from apc.parameter_values.parameter_names import ParameterRef, Range, unit_of
@@ -109,7 +110,7 @@ def _verdict(numeric: NumericModel, criterion: str | None) -> Plain:
             "notes": (*network.notes, "The modes are those of the nominal network."),
         }
         if network.mean_square_radius is not None:
-            moments |= {"measure": "growth factor of mean squares", "radius": network.mean_square_radius}
+            moments |= {"measure": "second-moment growth", "radius": network.mean_square_radius}
     values = np.array([mode.eigenvalue for mode in analysis.modes], dtype=np.complex128)
     return {
         "verdict": analysis.verdict + (", linearized" if analysis.linearized else ""),
@@ -141,10 +142,8 @@ def _dominant_mode_text(analysis: Analysis) -> str:
     dominant = analysis.modes[0]
     parts = sorted(dominant.participation, key=lambda pair: -pair[1])[:2]
     moves = " and ".join(name for name, _ in parts)
-    changes = "grows" if dominant.magnitude > 1 else "decays most slowly"
-    times = f"by {dominant.magnitude:.6g} each {analysis.frame_s * 1e3:.6g} ms"
-    name = _mode_text(dominant)
-    return f"{name[0].upper()}{name[1:]} {changes}, {times}; largest participation: {moves}."
+    factor = f"{dominant.magnitude:.6g} per frame of {analysis.frame_s * 1e3:.6g} ms"
+    return f"Dominant mode: {_mode_text(dominant)}, |eigenvalue| {factor}; largest participation: {moves}."
 
 
 def _region(numeric: NumericModel, request: tuple[Range, Range, str]) -> Plain:
@@ -190,7 +189,10 @@ def _thinned(values: Sequence[Fraction], most: int) -> list[Fraction]:
 
 def _margins(numeric: NumericModel, _: None) -> Plain:
     """Return the text of the stability margins."""
-    return {"text": str(margins(numeric, quick=True))}
+    lines = list(margins_table(margins(numeric, quick=True)))
+    if any(link.channel for link in numeric.model.links):
+        lines.append("  nominal network: packet loss and jitter are excluded")
+    return {"text": "\n".join(lines)}
 
 
 def _tune(numeric: NumericModel, request: tuple[tuple[str, ...], str]) -> Plain:

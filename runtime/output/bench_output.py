@@ -12,12 +12,14 @@ matplotlib is loaded when something is drawn and not before.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from apc.benchmark.speed_and_error import SAME, Bench, MethodTiming, TaskComparison
 from apc.compiler.wording import counted, wrapped
 from apc.output.formatting import Lines, notes, record, table
 from apc.output.pictures import COLOURS, new_figure
+from apc.support.optional import need
 from apc.verdict import StabilityVerdict
 
 if TYPE_CHECKING:
@@ -26,6 +28,7 @@ if TYPE_CHECKING:
 
 WIDTH, HEIGHT = 4.6, 4.2  # inches, of a panel
 MARKS = "osDv^P<>"  # of methods
+DECADES = 2  # of an axis with three labels in each
 LEAST = 1e-17  # where an error of zero is drawn
 NOTHING = "–"
 BETTER = (
@@ -90,7 +93,7 @@ def _choice(comparison: TaskComparison) -> str:
     if chosen.error is None:
         where = "not rated without a reference"
     else:
-        where = "Pareto-optimal" if chosen.front else "NOT Pareto-optimal"
+        where = "Pareto-optimal" if chosen.front else "not Pareto-optimal"
     return f"default method of {comparison.task}: {chosen.name} ({where})"
 
 
@@ -172,7 +175,7 @@ def bench_picture(bench: Bench) -> Any:
 def _panel(ax: Any, comparison: TaskComparison) -> None:
     """Draw the error of each method over its time, and the Pareto front."""
     ax.set_title(f"apc {comparison.task}", fontsize=10)
-    ax.set_xlabel("median time [s]")
+    ax.set_xlabel("median time [ms]")
     ax.set_ylabel(f"error of the {comparison.quantity}", fontsize=9)
     points = [measured for measured in comparison.measured if measured.error is not None]
     if not points:
@@ -182,15 +185,16 @@ def _panel(ax: Any, comparison: TaskComparison) -> None:
     ax.set(xscale="log", yscale="log")
     ax.margins(0.1)
     ax.grid(linewidth=0.4, alpha=0.6)
+    _label_ticks(ax.xaxis, [1e3 * point.seconds for point in points])
     front = [point for point in points if point.front]
-    steps = [[measured.seconds for measured in front], [_plotted(measured) for measured in front]]
+    steps = [[1e3 * measured.seconds for measured in front], [_plotted(measured) for measured in front]]
     ax.step(*steps, where="post", color="0.4", linewidth=1, zorder=1, label="Pareto front")
     for index, point in enumerate(points):
         colour = COLOURS[index % len(COLOURS)]
         ax.errorbar(
-            point.seconds,
+            1e3 * point.seconds,
             _plotted(point),
-            xerr=min(point.spread, 0.9 * point.seconds),
+            xerr=1e3 * min(point.spread, 0.9 * point.seconds),
             fmt=MARKS[index % len(MARKS)],
             color=colour,
             markerfacecolor=colour if point.chosen else "white",
@@ -202,13 +206,22 @@ def _panel(ax: Any, comparison: TaskComparison) -> None:
     ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), **style)  # every method is identified
 
 
+def _label_ticks(axis: Any, values: Sequence[float]) -> None:
+    """Label a logarithmic axis at 1, 2 and 5 of each decade; at 1 only in a range of more than `DECADES`."""
+    ticker = need("matplotlib.ticker", "plot")
+    wide = math.log10(max(values) / min(values)) > DECADES
+    axis.set_major_locator(ticker.LogLocator(subs=(1,) if wide else (1, 2, 5)))
+    axis.set_major_formatter(ticker.FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_formatter(ticker.NullFormatter())
+
+
 def _plotted(measured: MethodTiming) -> float:
     return max(measured.error or 0.0, LEAST)
 
 
 def _time(seconds: float) -> str:
     if seconds < 0.9995e-3:  # above, three digits would round it to 1e+03
-        return f"{seconds * 1e6:.3g} us"
+        return f"{seconds * 1e6:.3g} µs"
     return f"{seconds * 1e3:.4g} ms" if seconds < 1 else f"{seconds:.4g} s"
 
 

@@ -192,5 +192,5 @@ def _draw_ticks(ax: Any, topology: Topology, colours: dict[str, str]) -> None:
     ax.set_yticks([-row for row in range(len(names))], names, size=SIZE)
     ax.set(xlim=(0, float(frame) * 1e3), ylim=(0.5 - len(names), 0.5))
     ax.tick_params(labelsize=SIZE, length=2)
-    ax.set_xlabel(f"ms of one frame, {seconds(frame)}", size=SIZE, color=FAINT)
+    ax.set_xlabel(f"time in a frame of {seconds(frame)} [ms]", size=SIZE, color=FAINT)
     ax.spines[["top", "right", "left"]].set_visible(False)

@@ -43,6 +43,9 @@ Floats = NDArray[np.float64]
 # Lines of a table of frequencies in a terminal.
 SHOWN = 12
 
+# Points of a Nyquist curve for each frequency; the turn of its chords in rad up to which it is smoothed.
+FINER, TURN = 8, 0.5
+
 # Digits of a table's numbers, at most.
 DIGITS = 6
 
@@ -266,7 +269,8 @@ def transparency_picture(transparency: Transparency, kind: str = "bode", ax: Any
     size, *phases = axes
     size.set_title(f"{transparency.topology}: impedance at {transparency.at}", fontsize=9)
     if nyquist:
-        size.plot(transparency.impedance.real, transparency.impedance.imag, color=COLOURS[0])
+        curve = _smooth(np.log(transparency.frequency_hz), transparency.impedance)
+        size.plot(curve.real, curve.imag, color=COLOURS[0])
         for line in (size.axvline, size.axhline):
             line(0.0, color="#999999", linewidth=0.6)
         size.set_aspect("equal", adjustable="datalim")
@@ -298,6 +302,18 @@ def transparency_picture(transparency: Transparency, kind: str = "bode", ax: Any
     else:
         legend_below(ax, -0.2, ncols=1 + nyquist)
     return size.figure
+
+
+def _smooth(at: Floats, values: NDArray[np.complex128]) -> NDArray[np.complex128]:
+    """Return a curve (k,) with `FINER` times as many points, if its chords turn by less than `TURN`."""
+    turns = np.angle(np.diff(values)[1:] / np.where(np.diff(values)[:-1] == 0, 1, np.diff(values)[:-1]))
+    if len(values) < 4 or not np.all(np.abs(turns) < TURN):  # a spline could add loops
+        return values
+    from scipy.interpolate import CubicSpline
+
+    steps = np.linspace(0, len(at) - 1, FINER * (len(at) - 1) + 1)
+    finer: NDArray[np.complex128] = CubicSpline(at, values)(np.interp(steps, np.arange(len(at)), at))
+    return finer
 
 
 def transparency_rows(transparency: Transparency) -> Tabled:

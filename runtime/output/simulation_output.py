@@ -33,7 +33,7 @@ from apc.output.formatting import (
     sentences,
     table,
 )
-from apc.output.pictures import colours_of, new_figure, short_legend
+from apc.output.pictures import colours_of, new_figure, prefixed, short_legend
 from apc.simulation.motion_classes import MotionVerdict
 from apc.simulation.settings import EXACT
 from apc.support.optional import need
@@ -53,14 +53,14 @@ LABELS = {
     "copy_error": "coordination error [mm]",
 }
 MILLIMETRES = 1e3
-# By unit: the panel's title, the displayed unit, and its number per SI unit.
+# By unit: the panel's title.
 QUANTITIES = {
-    "m": ("position", "mm", 1e3),
-    "m/s": ("velocity", "m/s", 1.0),
-    "N": ("force", "N", 1.0),
-    "rad": ("angle", "rad", 1.0),
-    "rad/s": ("angular velocity", "rad/s", 1.0),
-    "N*m": ("torque", "N·m", 1.0),
+    "m": "position",
+    "m/s": "velocity",
+    "N": "force",
+    "rad": "angle",
+    "rad/s": "angular velocity",
+    "N*m": "torque",
 }
 DASHES = ("-", (0, (4, 1.5)), (0, (1, 1)), (0, (5, 1, 1, 1)), (0, (7, 2)), (0, (3, 1, 1, 1, 1, 1)))
 MOST_COLOURS = 10  # peers with a colour each; of more each group has one
@@ -304,7 +304,9 @@ def _draw_paths(ax: Any, trajectory: Trajectory, paths: Sequence[tuple[int, int]
 
 def _panel(ax: Any, trajectory: Trajectory, unit: str, indices: Sequence[int]) -> None:
     """Draw the signals of one unit, the columns `indices` of a trajectory, as curves over time."""
-    title, shown, scale = QUANTITIES.get(unit, ("", unit, 1.0))
+    title = QUANTITIES.get(unit, "")
+    largest = float(np.abs(trajectory.values[:, list(indices)]).max(initial=0.0))
+    scale, shown = prefixed(largest, unit)
     signals, values = trajectory.signals, scale * trajectory.values
     many = _are_many(signals)
     curves = _by_group(signals, indices) if many else _identical(values, indices)
@@ -318,7 +320,7 @@ def _panel(ax: Any, trajectory: Trajectory, unit: str, indices: Sequence[int]) -
         style = {"color": colour, "linestyle": dashes, "linewidth": 0.4 if many else 1.0}
         first, *_ = ax.plot(trajectory.time, values[:, columns if many else columns[:1]], **style)
         first.set_label("\n".join(textwrap.wrap(label, LABEL)))
-    ax.set_ylabel(f"{title} [{shown}]" if title else f"[{shown}]")
+    ax.set_ylabel(f"{title} [{shown.replace('*', '·')}]".strip())
     ax.margins(x=0)
     _finish(ax, len(curves))
 

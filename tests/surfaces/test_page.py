@@ -497,6 +497,7 @@ def test_peaks_of_an_impedance_are_resolved_and_inside_the_axes(tmp_path: Path) 
     figure.show(told)
     low, high = figure.plot.y_range.start, figure.plot.y_range.end
     decades = np.log10(high / low)
+    assert figure.magnitudes.ticks == [2, 5, 10, 20, 50] and figure.frequencies.ticks == [0.1, 1, 10]
     assert np.log10(high / dense.max()) > 0.05 * decades < np.log10(dense.min() / low) + 1e-2 * decades
 
 
@@ -516,7 +517,7 @@ def test_an_unreliable_topology_opens_with_mean_square_stability(tmp_path: Path)
     assert opened.criterion_select.value.startswith("mean-square")
     verdict = next(task for task in Asked.requested if task.section == "verdict")
     told = compute(model_bytes(opened.system), verdict).result
-    assert told is not None and told["measure"] == "growth factor of mean squares"
+    assert told is not None and told["measure"] == "second-moment growth"
     assert tab_of(compiled(AVERAGE, tmp_path)).criterion_select.value.startswith("nominal")
 
 

@@ -17,6 +17,7 @@ import pytest
 import apc
 from apc.output import animation
 from apc.output.analysis_output import analysis_picture
+from apc.output.haptics_output import transparency_picture
 from apc.output.pictures import colours_of, legend_below, write_figure
 from apc.output.region_picture import panels_picture
 from apc.regions.panels import compare_regions
@@ -125,8 +126,9 @@ def test_as_many_colours_as_are_asked_for(count: int) -> None:
     assert len(set(colours_of(count))) == count
 
 
-def test_the_eigenvalues_drawn_are_those_of_the_analysis_within_the_circle() -> None:
-    found = apc.analyze(compiled(AVERAGE))
+@pytest.mark.parametrize("certify", [False, True])
+def test_the_eigenvalues_drawn_are_those_of_the_analysis_within_the_circle(certify: bool) -> None:
+    found = apc.analyze(compiled(AVERAGE), certify=certify)
     ax = analysis_picture(found)
     drawn = np.concatenate([line.get_xydata() for line in ax.lines if line.get_marker() != "None"])
     requested = [mode.eigenvalue for mode in found.modes]
@@ -136,6 +138,15 @@ def test_the_eigenvalues_drawn_are_those_of_the_analysis_within_the_circle() -> 
     (low, high), (bottom, top) = ax.get_xlim(), ax.get_ylim()
     assert low < -1 < 1 < high and bottom < -1 < 1 < top
     assert "settling time (2 %)" in " ".join(ax.get_title().split())
+    assert any(", real, " in text.get_text() for text in ax.get_legend().get_texts())
+
+
+def test_signals_have_axes_with_a_prefix_of_their_unit() -> None:
+    """A device that starts at 0.1 m/s moves by less than 1 mm: in mm and mm/s, not 0.0008 m and 0.1 m/s."""
+    model = compiled(AVERAGE.replace("cube:   {", "cube:   {v: 0.1 m/s, ", 1))
+    figure = apc.simulate(model, duration="0.2 s").plot().figure
+    labels = [ax.get_ylabel() for ax in figure.axes]
+    assert labels[:2] == ["position [mm]", "velocity [mm/s]"]
 
 
 def test_text_in_an_svg_is_text(tmp_path: Path) -> None:
@@ -251,3 +262,16 @@ def test_settings_that_somebody_made_in_python_stay(cli: Cli) -> None:
     with matplotlib.rc_context({"animation.ffmpeg_path": "mine"}):
         assert cli(f"show '{TOPOLOGY}' --out a.png").code == 0
         assert matplotlib.rcParams["animation.ffmpeg_path"] == "mine"
+
+
+def test_a_nyquist_curve_has_no_corners_and_passes_the_computed_points() -> None:
+    found = apc.transparency(compiled(AVERAGE), np.geomspace(0.1, 60, 1000))
+    line, *_ = transparency_picture(found, "nyquist").axes[0].lines
+    drawn = line.get_xydata() @ [1, 1j]
+    assert np.abs(drawn[::8] - found.impedance).max() < 1e-12
+    exact = apc.transparency(compiled(AVERAGE), np.geomspace(0.1, 60, 7993)[4::80]).impedance
+    assert np.abs(drawn[4::80] - exact).max() < 1e-4 * np.abs(exact).max()
+    assert np.abs(np.angle(np.diff(drawn)[1:] / np.diff(drawn)[:-1])).max() < 0.05
+    few = apc.transparency(compiled(AVERAGE), np.geomspace(0.1, 60, 40))
+    line, *_ = transparency_picture(few, "nyquist").axes[0].lines
+    assert len(line.get_xydata()) == 40

@@ -87,7 +87,7 @@ def test_the_picture_names_every_part_with_its_type_and_numbers() -> None:
         *("three-users-average, one of 3 peers", "device", "mass 0.1 kg", "cube", "shared: 0.2 kg per copy"),
         *("contact", "SampledSpringDamper", "stiffness 1000 N/m", "delay 1 ms", "coordination"),
         *("AveragePosition", "lan", "delay 8 ms", "lan: 3 peers, complete graph"),
-        *("haptic: every 1 ms", "ms of one frame, 8 ms"),
+        *("haptic: every 1 ms", "time in a frame of 8 ms [ms]"),
     ):
         assert word in words, word
 
