@@ -32,34 +32,30 @@ def analyze_command(
     *,
     file: str | None,
     settings: tuple[str, ...],
-    method: str = option(
-        "auto, modes, dense, determinant or paper.", "METHOD", type=click.Choice(METHODS), default=AUTO
-    ),
+    method: str = option("Method, see above.", "METHOD", type=click.Choice(METHODS), default=AUTO),
     certify: bool = option("Prove the verdict in ball arithmetic."),
     box: tuple[str, ...] = option(
-        "Prove stability over a range, e.g. contact.stiffness=±1% (repeatable).",
+        "Prove stability over a range (repeatable).",
         "PATH=RANGE",
     ),
     cells: int | None = option(
-        "Maximum number of cells of a --box.",
+        "Most cells of --box.",
         "N",
         type=click.IntRange(min=1),
-        show_default="some seconds of work",
+        show_default="some seconds",
     ),
     changing: str | None = option(
         "Analyze changes of a number of peers, e.g. user.count=2:10.", "PATH=COUNTS"
     ),
     every_convention: bool = option("Repeat for every order of simultaneous events.", name="--event-order"),
     margins: bool | None = option(
-        "Compute all stability margins, or none.",
+        "Compute all margins, or none.",
         name="--margins/--no-margins",
         default=None,
-        show_default="all if fast",
+        show_default="if fast",
     ),
     nominal: bool = option("Also analyze the nominal network (no loss)."),
-    with_limit_cycle: bool = option(
-        "Predict limit cycles of contacts, and simulate up to 80 s for comparison.", name="--limit-cycle"
-    ),
+    with_limit_cycle: bool = option("Predict limit cycles of contacts, and simulate.", name="--limit-cycle"),
     modes: str = option("Rows of the mode table.", type=click.Choice(("slowest", "all")), default="slowest"),
     hands: str,
     operating_point: str,
@@ -73,10 +69,11 @@ def analyze_command(
     of the clock periods. FILE is a topology or a compiled model.
 
     \b
-    --method  modes: decoupled subsystems; dense: one matrix; determinant:
-              non-identical peers, long delays; paper: Rakhsha and
-              Constantinescu, eqs. (18) to (20)
-    --hands   clamped: fixed devices; held: hand.mass, hand.damping and
+    --method  auto; modes: decoupled subsystems; dense: one matrix;
+              determinant: non-identical peers, long delays; paper: Rakhsha
+              and Constantinescu, eqs. (18) to (20)
+    --box     e.g. contact.stiffness=±1% or lan.delay="8 ms:16 ms"
+    --hands   free; clamped: fixed devices; held: hand.mass, hand.damping and
               hand.stiffness by --set; passive: absolute stability with any
               passive operator; or a hand of the library (StylusArmForward)
     """

@@ -25,11 +25,9 @@ def bench_command(
     file: str | None,
     settings: tuple[str, ...],
     plot: Path | None = picture_option("Plot error against time (.png, .svg, .pdf)."),
-    counts: str | None = option(
-        "Measure with these numbers of peers (not with --set, --plot).", "3,30,300", name="--scale"
-    ),
+    counts: str | None = option("Measure with these numbers of peers.", "N1,N2,…", name="--scale"),
     folder: Path | None = option(
-        f"Analyze reference topologies with known results, by default {HARD}.",
+        "Analyze reference topologies.",
         "[FOLDER]",
         name="--hard",
         is_flag=False,
@@ -73,7 +71,7 @@ def bench_command(
 
         write_picture(lambda: bench_picture(result), plot)
         if not as_json:
-            echo(f"  {plot} is written")
+            echo(f"\n{plot} is written")
     if result.faults:
         message = f"incorrect results: {'; '.join(result.faults)}"
         raise ApcError(Diagnostic("E922", SourceLocation(result.topology), message))

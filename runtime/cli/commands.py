@@ -24,7 +24,8 @@ SECTIONS = {
     "Design": ("tune", "explore"),
     "Simulate": ("simulate", "run", "fit"),
     "Network": ("network",),
-    "Export": ("export", "report", "bench"),
+    "Export": ("export", "report"),
+    "Benchmark": ("bench",),
 }
 
 

@@ -28,13 +28,11 @@ from apc.compiler.errors import ApcError
 def compare_command(
     *,
     files: tuple[str, ...] = argument(nargs=-1, required=True, metavar="FILE..."),
-    over: tuple[str, ...] = option(
-        "Stiffness, delay or loss to vary, if there are several (repeatable).", "PATH"
-    ),
+    over: tuple[str, ...] = option("Stiffness, delay or loss to vary (repeatable).", "PATH"),
     settings: tuple[str, ...],
     criterion: str | None,
     hands: str,
-    at: str = option("Device of the impedance, or an axis of it.", "PEER.PART", show_default="first device"),
+    at: str = option("Device of the impedance.", "PEER.PART", show_default="first device"),
     out: Path | None = result_option(),
     as_json: bool,
 ) -> None:
@@ -43,7 +41,8 @@ def compare_command(
     The limits are those of the coupling stiffness, delay and packet loss. The
     impedance is that of the first peer's device at 1 and 10 Hz. --set,
     --criterion and --hands apply to every FILE, a topology or a compiled model.
-    For stability regions in one picture use apc region --compare.
+    --over names the varied parameters where there are several. For stability
+    regions in one picture use apc region --compare.
 
     A folder NAME.run of apc run is compared with simulation and analysis.
 

@@ -37,11 +37,11 @@ def check_command(
 
     path = find_input(file, compiled_too=False)
     if text := check_definition(path):
-        echo(f"{path}: no errors. {text}.")
+        echo(f"{path}: no errors ({text})")
         return
     system = compile_topology(path)
     check_values(system)
-    echo(f"{path}: no errors. {system.name}, {counted(system.peers, 'peer')}.")
+    echo(f"{path}: no errors ({system.name}, {counted(system.peers, 'peer')})")
     for line in warning_lines((*system.warnings, *replaced_elements(system))):
         echo(line)
 
@@ -51,7 +51,7 @@ def compile_command(
     *,
     file: str | None,
     until: str = option(
-        f"Stop after a stage and print its result: {', '.join(STAGES[:-1])}.",
+        "Stop after a stage and print its result.",
         "STAGE",
         type=click.Choice(STAGES),
         default="compiled",
@@ -64,6 +64,9 @@ def compile_command(
     Prints the model size: states, delays and packets per peer, and the sizes
     of the decoupled subsystems. A model that is up to date is not compiled
     again, except with --force or --timings.
+
+    \b
+    STAGE  source, topology, flat, clocked, sorted
     """
     from apc.inputs.open_model import check_model_name, compiled_already, find_input
 

@@ -45,9 +45,7 @@ def critical_command(
     settings: tuple[str, ...],
     upper: str | None = option("Upper end of the search.", '"VALUE UNIT"'),
     lower: str | None = option("Lower end of the search.", '"VALUE UNIT"'),
-    over: tuple[str, ...] = option(
-        "Find the largest value stable for all of user.count=2:10 (repeatable; see tune).", "PATH=LO:HI"
-    ),
+    over: tuple[str, ...] = option("Largest value stable over a range (repeatable).", "PATH=LO:HI"),
     criterion: str | None,
     hands: str,
     operating_point: str,
@@ -59,7 +57,8 @@ def critical_command(
     PATH is a stiffness, damping, mass, delay, period or number of peers:
     coordination.stiffness, left.device.mass, lan.delay, user.count. Limits are
     found up to a printed cell size, with error bounds and proof where possible.
-    FILE is a topology or a compiled model.
+    With --over user.count=2:10, the largest value stable for all numbers of
+    users. FILE is a topology or a compiled model.
     """
     from apc.inputs.open_model import open_topology
     from apc.studies.critical_values import critical

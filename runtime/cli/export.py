@@ -17,18 +17,12 @@ from apc.cli.options import command, note_aside, option, print_result
 def export_command(
     *,
     file: str | None,
-    to: str | None = option(
-        "control (.py), mat, npz, modelica (.mo), c, or fmu (FMI 2.0).", "FORMAT", show_default="from --out"
-    ),
+    to: str | None = option("Format, see above.", "FORMAT", show_default="from --out"),
     settings: tuple[str, ...],
-    open_at: str = option("Open the loop at a link or coupler; u = -y closes it.", "NAME"),
-    symbolic: tuple[str, ...] = option(
-        "Keep a parameter symbolic: matrices as a casadi.Function (repeatable).", "PATH"
-    ),
+    open_at: str = option("Open the loop at a link or coupler.", "NAME"),
+    symbolic: tuple[str, ...] = option("Keep a parameter symbolic (repeatable).", "PATH"),
     peer: str = option("Peer of the C code or FMU.", "NAME", show_default="fmu: all"),
-    device: str = option(
-        "Masses outside the C code, separated by commas, or none.", "MASS", show_default="the device"
-    ),
+    device: str = option("Masses outside the C code.", "MASS", show_default="the device"),
     method: str = option("Integration method; see simulate.", "METHOD"),
     out: Path = option("Output file."),
     as_json: bool,
@@ -39,6 +33,12 @@ def export_command(
     and measurement noise to positions, velocities and forces. The Modelica
     model contains all equations, clocks and packets. C code contains one peer,
     an FMU one peer or all. FILE is a topology or a compiled model.
+
+    \b
+    --to        control (.py), mat, npz, modelica (.mo), c or fmu (FMI 2.0)
+    --open-at   u = -y closes the loop
+    --symbolic  matrices as a casadi.Function of the parameters
+    --device    masses separated by commas, or none
 
     \b
         apc export --out loop.mat

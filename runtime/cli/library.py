@@ -62,7 +62,7 @@ def new_command(
     name: str | None = argument(required=False),
     like: str | None = option("Copy a topology of the library, with its tables.", "TOPOLOGY"),
     listing: bool = option("List the topologies of the library.", name="--list"),
-    out: Path | None = option("With --list: write a page with pictures and verdicts (.html)."),
+    out: Path | None = option("With --list: page with pictures (.html)."),
 ) -> None:
     """Create a commented topology, NAME.yaml.
 
@@ -99,7 +99,7 @@ def new_command(
     written = (
         f"{' and '.join([str(path), *(table.name for table in tables)])} {'are' if tables else 'is'} written"
     )
-    echo(f"{written}. Next: apc compile {path}")
+    echo(f"{written}. Next: apc analyze {path}")
 
 
 def _gallery(out: Path) -> str:

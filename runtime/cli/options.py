@@ -39,6 +39,18 @@ BY_TYPE: dict[str, dict[str, Any]] = {
 }
 
 
+class Option(click.Option):
+    """An option whose help has the default in brackets, and no bounds of numbers."""
+
+    def get_help_extra(self, ctx: click.Context) -> Any:
+        """Return the parts of the help in brackets."""
+        extra = super().get_help_extra(ctx)
+        extra.pop("range", None)
+        if isinstance(self.show_default, str):
+            extra["default"] = self.show_default
+        return extra
+
+
 def option(text: str, metavar: str | None = None, *, name: str = "", **settings: Any) -> Any:
     """Return a function that makes the click option of a parameter; it is the parameter's default value.
 
@@ -60,7 +72,7 @@ def option(text: str, metavar: str | None = None, *, name: str = "", **settings:
             **({"metavar": metavar} if metavar else {}),
         }
         option_settings = {"show_default": bool(settings.get("default")), **option_settings, **settings}
-        return click.Option(
+        return Option(
             [name or f"--{parameter.name.replace('_', '-')}", parameter.name], help=text, **option_settings
         )
 
@@ -87,13 +99,13 @@ def picture_option(text: str, more: Sequence[str] = ()) -> Any:
 
 def result_option() -> Any:
     """Return the option `--out` of a result that can be drawn, tabulated, or written as JSON."""
-    text = "Output file: picture (.png .svg .pdf), table (.csv .parquet) or .json."
+    text = "Output: .png .svg .pdf .csv .parquet .json."
     return picture_option(text, (".csv", ".parquet", ".json"))
 
 
 def seed_option() -> Any:
     """Return the option `--seed` of packet losses and delays."""
-    text = "Seed of packet losses and delays."
+    text = "Random seed."
     return option(text, "N", type=WholeNumber(0, 2**63 - 1), show_default="experiment: seed")
 
 
@@ -102,16 +114,14 @@ SHARED: dict[str, Callable[[inspect.Parameter], click.Parameter]] = {
     "file": argument(required=False),
     "settings": option("Set a parameter (repeatable).", 'PATH="VALUE UNIT"', name="--set"),
     "criterion": option(
-        "Stability criterion: mean-square (default on lossy links) or nominal (no loss, no jitter).",
+        "nominal, or mean-square (default if lossy).",
         "CRITERION",
         name="--criterion",
         type=click.Choice(("mean-square", "nominal")),
     ),
-    "hands": option(
-        "Operator model: free, clamped, held, passive, or a hand of the library.", "HANDS", default="free"
-    ),
+    "hands": option("Operator model, see analyze.", "HANDS", default="free"),
     "operating_point": option(
-        "Point of linearization: start (start values) or equilibrium (rest position).",
+        "Linearize at start or equilibrium.",
         "POINT",
         type=click.Choice(("start", "equilibrium")),
         default="start",
@@ -121,7 +131,7 @@ SHARED: dict[str, Callable[[inspect.Parameter], click.Parameter]] = {
 }
 
 
-DIGITS = click.Option(
+DIGITS = Option(
     ["--digits"],
     type=click.Choice(("6", "full")),
     default="6",
@@ -139,7 +149,7 @@ def command(function: Callable[..., None]) -> Command:
     ]
     if "as_json" in inspect.signature(function).parameters:
         made.append(DIGITS)
-    made.append(click.Option(["--timings"], is_flag=True, help="Print the time of each step on stderr."))
+    made.append(Option(["--timings"], is_flag=True, help="Print the time of each step on stderr."))
     name = function.__name__.removesuffix("_command")
     return Command(name, callback=function, params=made, help=inspect.cleandoc(function.__doc__ or ""))
 
@@ -203,7 +213,7 @@ class WholeNumber(click.IntRange):
 
 @part("print")
 def print_result(
-    result: Result, *, as_json: bool, written: Iterable[Path | None] = (), before: str | None = "\n"
+    result: Result, *, as_json: bool, written: Iterable[Path | None] = (), names_files: bool = False
 ) -> None:
     """Print a result, as text or as one JSON document, and the names of its files.
 
@@ -215,14 +225,14 @@ def print_result(
         Whether to print JSON, without other text.
     written
         The written files, or None; if one is stdout, the text is printed on stderr.
-    before
-        The text before the name of a file; None where the result names the file itself.
+    names_files
+        Whether the text of the result names the files itself.
     """
     files = [path for path in written if path is not None]
     err = prints_to_stderr(*files)
     echo(json_text(result.to_dict()) if as_json else str(result), err=err)
-    for path in () if as_json or before is None else files:
-        echo(f"{before}{path} is written", err=err)
+    if files and not as_json and not names_files:
+        echo("\n" + "\n".join(f"{path} is written" for path in files), err=err)
 
 
 def prints_to_stderr(*outputs: Path | None) -> bool:

@@ -36,9 +36,9 @@ def region_command(
     panels: tuple[str, ...] = option(
         "One panel with several values (repeatable).", '"PATH=V, …"', name="--panel"
     ),
-    normalize: bool = option("Multiply the gain y of a sum by the number of other peers."),
+    normalize: bool = option("Scale y by the number of other peers."),
     overlays: tuple[str, ...] = option(
-        "Draw a published condition; each symbol is a parameter or quantity.",
+        "Draw a published condition (repeatable).",
         "NAME:SYMBOL=PATH,…",
         name="--overlay",
     ),

@@ -30,7 +30,7 @@ def run_command(
     to: tuple[str, ...] = option("Address of another peer (repeatable).", "PEER=HOST:PORT"),
     emulate: bool = option("Emulate delay and loss of the links."),
     seed: int | None = seed_option(),
-    device: Path | None = option("Driver of the device: device(time, force) in .py, or apc_device in .so."),
+    device: Path | None = option("Driver of the device (.py, .so), see above."),
     secret_file: Path | None = option("Shared secret; other packets are dropped."),
     patience: str = option("Time to wait for the other peers.", '"TIME"', name="--wait", default="30 s"),
     out: Path | None = option("Folder of the recording.", "FOLDER", show_default="NAME.run"),
@@ -43,6 +43,9 @@ def run_command(
     folder NAME.run; apc compare NAME.run compares it with simulation and
     analysis. Hosts need clocks synchronized by NTP or PTP: a constant offset is
     removed at the start, drift is not.
+
+    \b
+    --device  device(time, force) in .py, or apc_device in .so
 
     \b
         apc run topology.yaml --duration "60 s" --emulate

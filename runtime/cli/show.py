@@ -27,11 +27,11 @@ def show_command(
     *,
     file: str | None,
     format_: str | None = option(
-        "text, json, dot (Graphviz), mermaid or svg.",
+        "text, json, dot, mermaid or svg.",
         "FORMAT",
         name="--format",
         type=click.Choice(["text", "json", "dot", "mermaid", "svg"]),
-        show_default="from --out, else text",
+        show_default="from --out",
     ),
     parameters: bool = option("List the parameters: names, values, units, limits."),
     out: Path | None = option("Output file (.txt .json .dot .mmd .svg .png .pdf)."),

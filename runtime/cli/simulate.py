@@ -44,28 +44,22 @@ def simulate_command(
     file: str | None,
     duration: str | None,
     settings: tuple[str, ...],
-    signals: tuple[str, ...] = option(
-        "Signals to record: cube.x, 'left[2].*', '*.v' (repeatable).", "PATTERN", show_default="all"
-    ),
-    out: Path | None = option("Output file: rows (.csv .parquet .mat .npz) or animation (.gif .mp4)."),
+    signals: tuple[str, ...] = option("Signals to record (repeatable).", "PATTERN", show_default="all"),
+    out: Path | None = option("Output: .csv .parquet .mat .npz .gif .mp4."),
     plot: Path | None = picture_option("Plot the signals (.png, .svg, .pdf)."),
     snapshot: Path | None = picture_option("Draw the initial state (.png, .svg, .pdf)."),
     as_json: bool,
     no_jit: bool = option("Disable compilation to machine code."),
     seed: int | None = seed_option(),
-    runs: int | None = option(
-        "Number of runs with random losses and delays.", "N", type=WholeNumber(1, 10_000_000)
-    ),
-    jobs: int = option("Number of processes for --runs.", "N", type=WholeNumber(1, 1024), default=1),
+    runs: int | None = option("Number of random runs.", "N", type=WholeNumber(1, 10_000_000)),
+    jobs: int = option("Processes for --runs.", "N", type=WholeNumber(1, 1024), default=1),
     method: str | None = option(
-        "exact, rk4:STEP, semi-implicit:STEP or cvodes:RTOL.",
+        "Integration method, see above.",
         "METHOD",
-        show_default="exact; cvodes if nonlinear",
+        show_default="exact",
     ),
     impulse: str | None = option("Start the device of a peer at 0.1 m/s.", "PEER"),
-    trace_of: str | None = option(
-        "Use the worst periodic loss pattern of analyze.", type=click.Choice(["worst"])
-    ),
+    trace_of: str | None = option("Use the worst loss pattern of analyze.", type=click.Choice(["worst"])),
     error: bool = option("Estimate the error with a more accurate run."),
 ) -> None:
     """Simulate a topology in time.
@@ -74,6 +68,11 @@ def simulate_command(
     size; CVODES integrates nonlinear dynamics. Each tick of the fastest clock
     gives one row, with the values before the tick. FILE is a topology or a
     compiled model.
+
+    \b
+    --method   exact, rk4:STEP, semi-implicit:STEP or cvodes:RTOL; by default
+               exact, of nonlinear dynamics cvodes
+    --signals  cube.x, 'left[2].*' or '*.v'
 
     \b
         apc simulate --duration "3 s" --plot run.png
@@ -178,6 +177,8 @@ def _simulate_single(system: Model, how: Settings, stored: _StoredRows, *, as_js
     if moving is not None and stored.signals:
         raise click.UsageError(f"--signals can't be combined with an animation ({moving.suffix})")
     simulation = prepare(system, how, signals=stored.signals)
+    if any(link.channel and (link.channel.loss or link.channel.jitter) for link in system.links):
+        note_aside(f"packet losses and delays are random, seed {simulation.seed}; statistics: --runs 100")
     keeper = Keeper(simulation) if stored.plot is not None or moving is not None else None
     comparison = compare_with(simulation, signals=stored.signals) if stored.error else None
     sinks = [sink for sink in (keeper, comparison) if sink is not None]
@@ -199,7 +200,7 @@ def _simulate_single(system: Model, how: Settings, stored: _StoredRows, *, as_js
         interrupted=interrupted,
         error=estimate,
     )
-    print_result(simulated, as_json=as_json, written=[out, plot, stored.snapshot], before="  ")
+    print_result(simulated, as_json=as_json, written=[out, plot, stored.snapshot])
     if interrupted:
         until = f"{summary.end:g} s of {float(how.duration):g} s"
         message = "completed rows are stored" if out else "no rows are stored"

@@ -33,22 +33,18 @@ def sweep_command(
     *,
     file: str | None,
     over: tuple[str, ...] = option(
-        "LOW:HIGH, LOW:HIGH:COUNT, LOW:HIGH:COUNT:log or V1,V2,… with units (repeatable).",
+        "Values with units (repeatable).",
         "PATH=VALUES",
         required=True,
     ),
     out: Path = option("Output file (.parquet, .csv)."),
-    of: str = option("Result at each point: analyze or critical:PATH.", "WHAT", default="analyze"),
+    of: str = option("analyze or critical:PATH.", "WHAT", default="analyze"),
     criterion: str | None,
     hands: str,
     settings: tuple[str, ...],
-    jobs: int | None = option(
-        "Number of processes.", "N", type=WholeNumber(min=1), show_default="all cores, after 2 s"
-    ),
+    jobs: int | None = option("Number of processes.", "N", type=WholeNumber(min=1), show_default="all cores"),
     cluster: str | None = option("Compute on a Dask cluster, tcp://HOST:8786.", "ADDRESS"),
-    patience: str | None = option(
-        "Abort after this time without a result.", '"TIME"', show_default="no limit"
-    ),
+    patience: str | None = option("Longest wait for a result.", '"TIME"', show_default="no limit"),
     as_json: bool,
 ) -> None:
     """Compute a result over a grid of parameter values.
@@ -58,6 +54,9 @@ def sweep_command(
     interrupted sweep. analyze: verdict, spectral radius with error, rigid
     modes, frequency and damping of the dominant mode. critical:PATH: the
     stability limit of another parameter, with error.
+
+    \b
+    VALUES  LOW:HIGH, LOW:HIGH:COUNT, LOW:HIGH:COUNT:log or V1,V2,…
 
     \b
         apc sweep --over contact.stiffness="100 N/m:3000 N/m:30" \\
@@ -86,7 +85,7 @@ def sweep_command(
             progress=progress,
             patience=waiting,
         )
-    print_result(result, as_json=as_json, written=[out], before=None)
+    print_result(result, as_json=as_json, written=[out], names_files=True)
 
 
 def _seconds(patience: str | None) -> float | None:

@@ -26,17 +26,13 @@ def transparency_command(
     file: str | None,
     settings: tuple[str, ...],
     operating_point: str,
-    at: str = option(
-        "Device, or an axis of it, e.g. left[1].device.x[2].", "PEER.PART", show_default="first device"
-    ),
+    at: str = option("Device, or an axis of it.", "PEER.PART", show_default="first device"),
     between: str = option("Device of the force and device of the velocity.", "A:B"),
     low: str = option("Lowest frequency.", '"F Hz"', name="--from", default="0.1 Hz"),
-    high: str | None = option(
-        "Highest frequency.", '"F Hz"', name="--to", show_default="60 Hz, at most Nyquist"
-    ),
+    high: str | None = option("Highest frequency.", '"F Hz"', name="--to", show_default="60 Hz or Nyquist"),
     points: int = option("Number of frequencies.", "N", type=WholeNumber(2, 1_000_000), default=1000),
     frequencies: str | None = option("List of frequencies, e.g. 1 Hz, 5 Hz.", '"F Hz, …"'),
-    unstable: bool = option("Evaluate the transfer function of an unstable topology."),
+    unstable: bool = option("Evaluate an unstable topology."),
     nyquist: bool = option("Draw a Nyquist plot instead of a Bode plot."),
     out: Path | None = result_option(),
     as_json: bool,
@@ -50,6 +46,7 @@ def transparency_command(
 
     \b
         apc transparency --at "user[1].device" --frequencies "1 Hz, 5 Hz"
+        apc transparency --at "left[1].device.x[2]"
         apc transparency --from "0.1 Hz" --to "60 Hz" --out bode.svg
     """
     from apc.haptics.device_port import read_frequencies

@@ -33,21 +33,15 @@ def tune_command(
     free: tuple[str, ...] = option("Gain to tune, with its range (repeatable).", "PATH=LO:HI"),
     maximize: str = option("Objective to maximize.", "OBJECTIVE"),
     minimize: str = option("Objective to minimize.", "OBJECTIVE"),
-    constraint: tuple[str, ...] = option("Requirement in addition to stability (repeatable).", "CONSTRAINT"),
-    tradeoff: str = option(
-        "Compute a Pareto front of 20 points against a quantity, e.g. impedance at 5 Hz.", "QUANTITY"
-    ),
-    over: tuple[str, ...] = option(
-        "Operating range: user.count=2:10, device.mass=±20%, lan.loss=0:0.05 (repeatable).", "PATH=LO:HI"
-    ),
+    constraint: tuple[str, ...] = option("Further requirement (repeatable).", "CONSTRAINT"),
+    tradeoff: str = option("Compute a Pareto front against a quantity.", "QUANTITY"),
+    over: tuple[str, ...] = option("Operating range (repeatable).", "PATH=LO:HI"),
     hands: str,
     operating_point: str,
     time: str = option("Time limit of the search.", '"TIME"', show_default="no limit"),
     settings: tuple[str, ...],
-    write: Path | None = option("Write the topology with the tuned gains (.yaml)."),
-    plot: Path | None = picture_option(
-        "Plot the stability region and impulse response, or the Pareto front (.png, .svg, .pdf)."
-    ),
+    write: Path | None = option("Write the tuned topology (.yaml)."),
+    plot: Path | None = picture_option("Plot region and response (.png, .svg, .pdf)."),
     as_json: bool,
 ) -> None:
     """Tune gains for an objective, with a proof of stability.
@@ -63,6 +57,8 @@ def tune_command(
                 weighted sum, "damping - 0.01*coordination.stiffness"
     CONSTRAINT  "decay=60 dB in 2 s", "impedance at 5 Hz < 20 N*s/m" or another
                 of these quantities, delay=changing (delays that vary in time)
+    --over      user.count=2:10, device.mass=±20%, lan.loss=0:0.05
+    --tradeoff  one of these quantities, e.g. "impedance at 5 Hz"
 
     \b
         apc tune --free "coordination.stiffness=10 N/m:5000 N/m" \\

@@ -110,7 +110,7 @@ def test_every_topology_of_the_library_is_listed_and_copied_so_that_it_is_sound(
 
 def test_a_copy_takes_another_name_and_brings_the_tables_it_names(call: Call) -> None:
     assert call("new", "mine", "--like", "users-table")[1] == (
-        "mine.yaml and users.csv are written. Next: apc compile mine.yaml\n"
+        "mine.yaml and users.csv are written. Next: apc analyze mine.yaml\n"
     )
     assert apc.compile("mine.yaml").name == "mine"
     assert call("new", "other", "--like", "users-table")[0] == 0  # the table is there as it is

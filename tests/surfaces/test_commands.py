@@ -35,7 +35,7 @@ def topology(cli: Cli) -> Cli:
 
 
 def test_from_nothing_to_a_verdict_in_three_commands(cli: Cli) -> None:
-    assert cli("new") == Ran(0, "topology.yaml is written. Next: apc compile topology.yaml\n", "")
+    assert cli("new") == Ran(0, "topology.yaml is written. Next: apc analyze topology.yaml\n", "")
     compiled, analyzed = cli("compile"), cli("analyze")
     assert (compiled.code, compiled.err, analyzed.code, analyzed.err) == (0, "", 0, "")
     assert compiled.out.startswith("topology → topology.apc\n  8 states per peer")
@@ -61,7 +61,7 @@ def test_new_takes_a_plain_name_only(cli: Cli, name: str) -> None:
 
 
 def test_check_builds_nothing_and_reports_every_mistake(topology: Cli) -> None:
-    assert topology("check") == Ran(0, "topology.yaml: no errors. three-users-average, 3 peers.\n", "")
+    assert topology("check") == Ran(0, "topology.yaml: no errors (three-users-average, 3 peers)\n", "")
     write("topology.yaml", AVERAGE.replace("0.1 kg", "0.1").replace("link: lan", "link: lam"))
     ran = topology("check")
     assert (ran.code, ran.out) == (1, "")
@@ -159,23 +159,23 @@ def test_help_fits_a_terminal_and_every_command_is_one_of_ours(cli: Cli) -> None
     assert cli("--version") == Ran(0, f"apc {apc.__version__}\n", "")
 
 
-def test_the_help_of_an_option_has_at_most_two_lines_of_80_columns() -> None:
+def test_the_help_of_an_option_has_one_line_of_80_columns() -> None:
     context = click.Context(group)
     for name in group.list_commands(context):
         command = group.get_command(context, name)
         assert command is not None
         formatter = click.HelpFormatter(width=80)
         command.format_options(click.Context(command, help_option_names=["-h", "--help"]), formatter)
-        rows = re.split(r"^  (?=-)", formatter.getvalue(), flags=re.MULTILINE)[1:]
+        _, *rows = formatter.getvalue().splitlines()
         assert len(rows) >= 2
-        # A name of more than 30 columns has a line of its own.
-        assert [row for row in rows if row.count("\n") > (2 + (len(row.splitlines()[0]) < 31))] == [], name
+        assert [row for row in rows if not re.match(r"  -.*\S {2,}\S", row)] == [], name
+        assert not any("<=" in row or "(from" in row for row in rows), name
 
 
 def test_the_commands_are_listed_once_by_section_with_complete_sentences(cli: Cli) -> None:
     shown = cli("--help").out
     sections = re.findall(r"^(\w+):\n((?:  .*\n)+)", shown, re.MULTILINE)
-    names = ["Options", "Start", "Analyze", "Design", "Simulate", "Network", "Export"]
+    names = ["Options", "Start", "Analyze", "Design", "Simulate", "Network", "Export", "Benchmark"]
     assert [title for title, _ in sections] == names
     rows = [row.split(maxsplit=1) for _, block in sections[1:] for row in block.splitlines()]
     assert sorted(name for name, _ in rows) == sorted(

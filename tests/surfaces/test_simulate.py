@@ -34,7 +34,7 @@ def test_rows_and_picture_are_written_and_named(moved: Cli) -> None:
     pytest.importorskip("matplotlib")
     ran = moved("simulate topology.yaml --duration 50ms --signals cube.x --out run.csv --plot run.svg")
     assert ran.code == 0
-    assert ran.out.endswith("  run.csv is written\n  run.svg is written\n")
+    assert ran.out.endswith("\n\nrun.csv is written\nrun.svg is written\n")
     lines = Path("run.csv").read_text(encoding="utf-8").splitlines()
     assert lines[0] == "time [s],user[1].cube.x [m],user[2].cube.x [m],user[3].cube.x [m]"
     assert len(lines) == 52
