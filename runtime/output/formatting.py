@@ -23,7 +23,7 @@ from decimal import Decimal
 from fractions import Fraction
 from typing import Any
 
-from apc.compiler.wording import measured, with_unit, wrapped
+from apc.compiler.wording import WIDTH, measured, with_unit, wrapped
 from apc.parameter_values.display_units import as_shown
 from apc.result import Result
 from apc.support.lazy import LazyTuple
@@ -292,9 +292,10 @@ def table(rows: Sequence[Sequence[str]], sides: str = "", *, later: int | None =
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     if sides[-1] == "<":
         widths[-1] = 0
+    gap = "  " if sum(widths) + 2 * len(widths) <= WIDTH else " "
     for row in rows:
         cells = [f"{cell:{side}{width}}" for cell, side, width in zip(row, sides, widths, strict=True)]
-        first = "  " + "".join(f"{cell}  " for cell in cells[:-1])
+        first = "  " + "".join(f"{cell}{gap}" for cell in cells[:-1])
         first += " " * (len(cells[-1]) - len(row[-1]))
         for line in wrapped(row[-1], first, " " * (len(first) if later is None else later)) or [""]:
             yield line.rstrip()

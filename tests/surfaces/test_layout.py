@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from apc.analysis.box_result import ChangingDelay
 from apc.output.analysis_output import changing_text
-from apc.output.formatting import capitalized, full_digits, quantity, span, with_error, without_dashes
+from apc.output.formatting import capitalized, full_digits, quantity, span, table, with_error, without_dashes
 from tests.commands import Cli
 from tests.topologies import TOPOLOGIES
 
@@ -167,3 +167,12 @@ def test_orders_of_events_are_in_the_words_of_the_default_order(cli: Cli) -> Non
     assert "such as: send, deliver, compute, apply" in orders
     assert not re.search(r"\btick\b <|\bact\b", orders)
     assert max(map(len, out.splitlines())) <= 80
+
+
+def test_a_table_that_is_too_wide_has_narrow_gaps_and_no_broken_row() -> None:
+    rows = [("name", "value", "ratio"), ("n" * 40, "v" * 28, "1.234567")]
+    assert list(table(rows, "<<>")) == [
+        f"  {'name':40} {'value':28}    ratio",
+        f"  {'n' * 40} {'v' * 28} 1.234567",
+    ]
+    assert [len(line) for line in table([(cell[:30], *others) for cell, *others in rows], "<<>")] == [72, 72]
