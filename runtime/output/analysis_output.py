@@ -67,7 +67,8 @@ LARGE = 1e4  # a larger magnitude needs another notation to fit its column
 LEAST_SHARE = 0.005  # shows as zero
 PAST = "(-"  # in the name of a state that is a past value, such as x(-1 ms)
 HEADINGS = ("|eigenvalue|", "type", "f [Hz]", "damping", "participation [%]")
-MODES = "Modes (slowest first; × n: multiplicity; a conjugate pair is one row)"
+MODES = "Modes (slowest first; a conjugate pair is one row)"
+MULTIPLE = "Modes (slowest first; × n: multiplicity; a conjugate pair is one row)"
 
 NOT_SIMULATED = "not predicted: --limit-cycle"
 SHOWN = 1e-9  # digits of a contact mode's spectral radius that its column has room for
@@ -136,7 +137,7 @@ def _pairwise(system: Model) -> Iterator[str]:
 def analysis_text(result: Analysis) -> Lines:
     """Yield the output of `apc analyze` without further results: verdict, summary, modes."""
     yield from _summary(result)
-    yield from headed(MODES, _mode_table(result.modes))
+    yield from headed(_modes_title(result.modes), _mode_table(result.modes))
     if result.notes:
         yield ""
         yield from notes(*result.notes)
@@ -253,7 +254,8 @@ def answer_text(answer: AnalysisReport) -> Lines:
         yield from _summary(analysis, warnings)
         yield from margins_lines(answer.margins)
         yield from sensitivities_lines(answer.sensitivities)
-        yield from headed(MODES, _mode_table(analysis.modes, everything=answer.all_modes))
+        title = _modes_title(analysis.modes)
+        yield from headed(title, _mode_table(analysis.modes, everything=answer.all_modes))
     for part in (answer.contact_modes, answer.arbitrary_switching, answer.limit_cycle):
         if part is not None:
             yield f"\n{part}"
@@ -329,6 +331,11 @@ def answer_document(answer: AnalysisReport) -> Plain:
     if answer.box is not None:
         plain["box"] = answer.box.to_dict()
     return plain
+
+
+def _modes_title(modes: Sequence[Mode]) -> str:
+    """Return the title of the table of modes, which explains multiplicities if there are any."""
+    return MULTIPLE if any(mode.multiplicity > 1 for mode in modes) else MODES
 
 
 def _mode_table(modes: Sequence[Mode], *, everything: bool = False) -> Lines:

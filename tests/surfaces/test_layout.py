@@ -138,6 +138,7 @@ def test_forces_above_ten_thousand_have_a_prefix(value: float, unit: str, text: 
 def test_a_mode_has_one_row_of_the_table(cli: Cli) -> None:
     for name in ("three-users-average", "teleoperation-pair"):
         text = cli(f"analyze --no-margins {TOPOLOGIES / name}.yaml").out.partition("Modes (")[2]
+        assert ("multiplicity" in text) == (" × " in text)
         rows = text.partition("participation [%]\n")[2].partition("  (-T)")[0].splitlines()
         assert rows and all(re.match(r" +[\d.]+  (\w| × )+ .* \d+$", row) for row in rows)
 
