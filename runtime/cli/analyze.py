@@ -44,9 +44,7 @@ def analyze_command(
         type=click.IntRange(min=1),
         show_default="some seconds",
     ),
-    changing: str | None = option(
-        "Analyze changes of a number of peers, e.g. user.count=2:10.", "PATH=COUNTS"
-    ),
+    changing: str | None = option("Analyze changes of a number of peers.", "PATH=COUNTS"),
     every_convention: bool = option("Repeat for every order of simultaneous events.", name="--event-order"),
     margins: bool | None = option(
         "Compute all margins, or none.",
@@ -73,6 +71,8 @@ def analyze_command(
               determinant: non-identical peers, long delays; paper: Rakhsha
               and Constantinescu, eqs. (18) to (20)
     --box     e.g. contact.stiffness=±1% or lan.delay="8 ms:16 ms"
+    --changing  e.g. user.count=2:10
+    --operating-point  start (start values) or equilibrium (rest position)
     --hands   free; clamped: fixed devices; held: hand.mass, hand.damping and
               hand.stiffness by --set; passive: absolute stability with any
               passive operator; or a hand of the library (StylusArmForward)

@@ -121,7 +121,7 @@ SHARED: dict[str, Callable[[inspect.Parameter], click.Parameter]] = {
     ),
     "hands": option("Operator model, see analyze.", "HANDS", default="free"),
     "operating_point": option(
-        "Linearize at start or equilibrium.",
+        "start or equilibrium.",
         "POINT",
         type=click.Choice(("start", "equilibrium")),
         default="start",

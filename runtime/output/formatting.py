@@ -3,7 +3,8 @@
 Takes: frozen values, texts.
 Gives: `Plain`, `document`, `record`, `picked`, `reached`, `json_text`; `full_digits`, `radius_text`,
 `quantity`, `with_error`, `rounds_to`, `uncertain`, `span`, `axis_label`, `listed`, `point_text`,
-`capitalized`; `Lines`, `notes`, `sentences`, `labelled`, `headed`, `table`, `without_dashes`; `MEANT`, `JUMP`.
+`capitalized`; `Lines`, `notes`, `sentences`, `labelled`, `headed`, `table`, `without_dashes`; `MEANT`,
+`JUMP`.
 Guarantees: a document is made of what JSON has words for; the same value gives the same text; a line is at
 most 80 columns wide where its words allow it.
 Does not: know a result.
