@@ -22,13 +22,11 @@ def fit_command(
     file: str | None,
     free: tuple[str, ...] = option("Parameter to estimate, with its range (repeatable).", "PATH=LO:HI"),
     settings: tuple[str, ...],
-    signals: tuple[str, ...] = option(
-        "Measured signals to compare (repeatable).", "PATTERN", show_default="all of RECORDING"
-    ),
+    signals: tuple[str, ...] = option("Measured signals (repeatable).", "PATTERN", show_default="all"),
     method: str | None = option(
-        "exact, rk4:STEP, semi-implicit:STEP or cvodes:RTOL.",
+        "Integration method, see simulate.",
         "METHOD",
-        show_default="exact; cvodes if nonlinear",
+        show_default="exact",
     ),
     write: Path | None = option("Write the topology with the estimates (.yaml)."),
     plot: Path | None = picture_option("Plot the residuals (.png, .svg, .pdf)."),
