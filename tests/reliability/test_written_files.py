@@ -376,6 +376,8 @@ WRITING = {
     ("compare", "--out"): ("topology.yaml", "new.json"),
     ("critical", "--plot"): ("contact.stiffness topology.yaml", "new.svg"),
     ("export", "--out"): ("topology.yaml", "new.npz"),
+    ("fit", "--write"): ("delays.csv topology.yaml --free contact.stiffness=1N/m:9N/m", "a.yaml"),
+    ("fit", "--plot"): ("delays.csv topology.yaml --free contact.stiffness=1N/m:9N/m", "new.svg"),
     ("transparency", "--out"): ("topology.yaml", "new.csv"),
     ("network", "--out"): ("delays.csv", "new.csv"),
     ("new", "--out"): ("--list", "new.html"),

@@ -80,15 +80,15 @@ def read_recording(path: Path) -> MeasuredTable:
         raise ApcError(Diagnostic("E701", SourceLocation(str(path)), f"{path} {refused.words}")) from None
     except (ValueError, TypeError, LookupError, OSError, NotImplementedError):  # those of the libraries
         expected = "a table in a .csv, .parquet or .mat file (version 5), or the folder of apc run"
-        raise _fault(path, "E711", "recording", expected, "another file") from None
+        raise _recording_error(path, "E711", "recording", expected, "another file") from None
     times = [column.numbers for column in columns if column.name == TIME and column.unit.dimension == SECOND]
     if not times:
         names = ", ".join(column.name for column in columns[:6])
-        raise _fault(path, "E711", "columns", f"a column {EXAMPLE}", names)
+        raise _recording_error(path, "E711", "columns", f"a column {EXAMPLE}", names)
     for column in columns:
         for row in np.flatnonzero(~np.isfinite(column.numbers))[:1].tolist():
             got = f"{column.numbers[row]:g}"
-            raise _fault(path, "E712", f"{column.name}, row {row + 1}", "a finite number", got)
+            raise _recording_error(path, "E712", f"{column.name}, row {row + 1}", "a finite number", got)
     interval, others = _interval(path, times[0]), (column for column in columns if column.name != TIME)
     even = np.arange(len(times[0])) * interval.numerator / interval.denominator
     return MeasuredTable(str(path), tuple(others), even, interval, float(times[0][0]))
@@ -117,7 +117,7 @@ def _read_mat(path: Path) -> list[MeasuredColumn]:
     time, values, names, units = (variables[name] for name in VARIABLES)
     if time.size != len(values) or not names.size == units.size == values.shape[1]:
         expected = f"{time.size} rows and {names.size} columns, as in time, names and units"
-        raise _fault(path, "E711", "values", expected, " by ".join(map(str, values.shape)))
+        raise _recording_error(path, "E711", "values", expected, " by ".join(map(str, values.shape)))
     pairs = zip(names.ravel(), units.ravel(), strict=True)
     headings = [EXAMPLE, *(f"{name[0]} [{unit[0]}]" for name, unit in pairs)]
     return _columns(path, headings, [time.ravel(), *values.T])
@@ -136,7 +136,7 @@ def _interval(path: Path, times: Floats) -> Fraction:
     """Return the interval of equidistant times, the simplest fraction of a second. Raises ApcError E712."""
     steps = np.diff(times)
     if not len(steps):
-        raise _fault(path, "E712", "rows", "two or more", f"{len(times)}")
+        raise _recording_error(path, "E712", "rows", "two or more", f"{len(times)}")
     step = float(np.median(steps))
     gaps = np.flatnonzero(np.abs(steps - step) > UNEVEN * abs(step))
     got = f"{1e3 * steps[gaps[0]]:.6g} ms after row {gaps[0] + 1}" if len(gaps) else "a drift"
@@ -146,9 +146,11 @@ def _interval(path: Path, times: Floats) -> Fraction:
         if np.abs(times - times[0] - np.arange(len(times)) * float(interval)).max() <= UNEVEN * mean:
             return interval
     advice = "fit one part of the recording without gaps, or resample it at equal intervals"
-    raise _fault(path, "E712", "time", f"equal intervals of {1e3 * step:.6g} ms", got, advice)
+    raise _recording_error(path, "E712", "time", f"equal intervals of {1e3 * step:.6g} ms", got, advice)
 
 
-def _fault(path: Path, code: str, message: str, expected: str, got: str, advice: str = "") -> ApcError:
+def _recording_error(
+    path: Path, code: str, message: str, expected: str, got: str, advice: str = ""
+) -> ApcError:
     """Return an error of a recording."""
     return ApcError(Diagnostic(code, SourceLocation(str(path)), message, expected, got, advice=advice))
