@@ -142,10 +142,10 @@ def test_a_box_stands_before_the_answer_and_says_that_more_cells_may_decide_it(
     words = ["analyze", str(tmp_path / "topology.yaml"), "--box", "coordination.stiffness=100 N/m:1 N/mm"]
     assert run([*words, "--cells", "1"]) == 0
     text = capsys.readouterr().out
-    assert text.startswith("three-users-average:\nundecided in 100 % of the box (1 cell)")
+    assert text.startswith("three-users-average: undecided in 100 % of the box (1 cell)")
     assert "--cells 10\n" in text
     assert run(words) == 0
-    assert capsys.readouterr().out.startswith("three-users-average:\nproved stable")
+    assert capsys.readouterr().out.startswith("three-users-average: proved stable")
 
 
 def test_a_box_over_a_delay_is_stable_where_every_delay_in_it_is() -> None:

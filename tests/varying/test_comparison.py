@@ -275,7 +275,7 @@ def test_notes_name_differences_other_than_the_coupling_and_limitations() -> Non
     assert found.limitations == (
         "3: excluded: packet loss (10 %) of lan; every packet has the nominal delay of 8 ms",
     )
-    assert "\n  Criterion for unreliable links: " in str(found)
+    assert "\n  criterion for unreliable links: " in str(found)
 
 
 # ---- the command ----
