@@ -75,8 +75,14 @@ class SideVerdict:
 
 
 def worst_side(verdicts: Sequence[SideVerdict]) -> int:
-    """Return the index of the verdict with the largest severity."""
-    return max(range(len(verdicts)), key=lambda n: severity(verdicts[n].stable, verdicts[n].spectral_radius))
+    """Return the index of the worst verdict; with neutral motions a stable side is worse than without."""
+
+    def key(n: int) -> tuple[int, bool, float]:
+        """Return the severity of a verdict, neutral motions before the spectral radius."""
+        rank, radius = severity(verdicts[n].stable, verdicts[n].spectral_radius)
+        return rank, verdicts[n].verdict is not StabilityVerdict.STABLE, radius
+
+    return max(range(len(verdicts)), key=key)
 
 
 def severity(stable: bool | None, measure: float) -> tuple[int, float]:

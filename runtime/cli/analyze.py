@@ -83,6 +83,13 @@ def analyze_command(
 
     if cells is not None and not box and hands in (*HANDS, PASSIVE):  # hands of the library make a box
         raise click.UsageError("--cells requires --box")
+    if changing is not None:
+        given = {"--plot": plot is not None, "--box": bool(box), "--event-order": every_convention}
+        given |= {"--limit-cycle": with_limit_cycle, "--certify": certify, "--method": method != AUTO}
+        given |= {"--margins": margins is not None, "--nominal": nominal, "--modes": modes != "slowest"}
+        given |= {"--hands passive": hands == PASSIVE, "--operating-point": operating_point != "start"}
+        if refused := [name for name, is_given in given.items() if is_given]:
+            raise click.UsageError(f"--changing can't be combined with {', '.join(refused)}")
     system = open_topology(
         file,
         settings,

@@ -363,7 +363,10 @@ def root_of(equations: EquilibriumEquations) -> Floats:
     finite = np.isfinite(z).all() and np.isfinite(equations.evaluated(z)[0]).all()
     subject = equations.unbalanced(z) if finite else "an equation has no finite value or slope"
     message = f"no equilibrium found: {subject} at the last step"
-    advice = f"set start values near the equilibrium, or {at_start}"
+    advice = (
+        'set start values near the equilibrium, take those of apc.operating_point(initial="simulation"), or '
+        f"{at_start}"
+    )
     raise ApcError(Diagnostic("E848", location, message, advice=advice))
 
 

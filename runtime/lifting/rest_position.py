@@ -43,6 +43,7 @@ OPERATING_POINTS = (START, EQUILIBRIUM)
 
 SHORT = 0.1  # m: shorter lengths are displayed in mm
 MOST_NOTED = 6  # positions in one line
+OTHERS_MAY_EXIST = "the equilibrium is the one found from the start values; others may exist"
 CACHE_SIZE = 32  # models with cached equilibria
 
 Floats = NDArray[np.float64]
@@ -134,6 +135,7 @@ def equilibrium_note(system: Model) -> tuple[str, ...]:
     shown = [f"{position.name} = {position.text}" for position in positions[:MOST_NOTED]]
     return (
         f"equilibrium at the present values: {', '.join([*shown, *['…'][: len(positions) - MOST_NOTED]])}",
+        OTHERS_MAY_EXIST,
     )
 
 

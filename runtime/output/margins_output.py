@@ -1,7 +1,8 @@
 """Stability margins and sensitivities as text and plain data.
 
 Takes: a `Margins`, a `Sensitivities`.
-Gives: the text and document of each; `margins_lines` and `sensitivities_lines`, tables with a title.
+Gives: the text and document of each; `margins_lines` and `sensitivities_lines`, tables with a
+title; `margins_table`.
 Guarantees: numbers have the digits that their errors permit.
 Does not: compute.
 """

@@ -21,7 +21,9 @@ NEAR_START = "nonlinear topology: the result holds near the initial state"
 
 def changing_counts_text(result: ChangingCounts) -> Lines:
     """Yield the verdict, the time between changes, the growing sequence, and the families of motions."""
-    yield f"{result.topology}: {result.verdict} of the number of peers"
+    alone = len(result.sequence) == 1
+    verdict = f"unstable with {result.parameter} = {result.sequence[0]}" if alone else result.verdict
+    yield f"{result.topology}: {verdict}{'' if alone else ' of the number of peers'}"
     notes = [NEAR_START] * result.linearized + [LEFT_OUT] * result.lossy
     for note in notes:
         yield from wrapped(note, "  ", "    ")
@@ -34,9 +36,7 @@ def changing_counts_text(result: ChangingCounts) -> Lines:
             "between changes, proved"
         )
         yield from wrapped(text, "  ", "    ")
-    if len(result.sequence) == 1:
-        yield f"  unstable with {result.parameter} = {result.sequence[0]}"
-    elif result.sequence:
+    if result.sequence and not alone:
         sequence = ", ".join(map(str, result.sequence))
         text = (
             f"grows by a factor of {result.growth:.6g} per frame if {result.parameter} is {sequence} in "
@@ -48,8 +48,9 @@ def changing_counts_text(result: ChangingCounts) -> Lines:
     yield from table([("family", "states", "common function", "frames", "growing sequence"), *rows], "<><><")
     legend = (
         "common function: one quadratic function that decreases for every number of peers; frames: proved "
-        "to suffice between changes; a joining peer starts at the mean of the others; changes at the starts "
-        f"of frames of {1000 * result.frame_s:.6g} ms"
+        "to suffice between changes; a joining peer starts at the mean of the other peers of its group, the "
+        "packets of a leaving peer are dropped; changes at the starts of frames of "
+        f"{1000 * result.frame_s:.6g} ms; constant forces are left out"
     )
     yield from wrapped(legend, "  ", "  ")
 

@@ -74,7 +74,7 @@ class ChangeVerdict(Term):
     """The verdict under changes of the number of peers."""
 
     ARBITRARY = "stable under arbitrary changes"
-    DWELL = "stable if changes are rare enough"
+    DWELL = "stable under rare changes"
     UNSTABLE = "unstable under a sequence of changes"
     UNDECIDED = "undecided"
 
