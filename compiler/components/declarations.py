@@ -189,9 +189,9 @@ def read_parameters(root: MappingReader) -> tuple[Parameter, ...]:
         if isinstance(value, Scalar):
             if value.text in ROLES:
                 return [Reference(name, value.text, "", value.location)]
-            expected, fix = f"{', '.join(ROLES)}, or a mapping with its unit", "{unit: N/m, min: 0}"
-            got, fix = brief(value.text) or "nothing", nearest(value.text, ROLES) or fix
-            raise fault("E203", value.location, message, expected, got, f"{name}: {fix}")
+            expected = f"{', '.join(ROLES)}, or a mapping such as {{unit: N/m, min: 0}}"
+            got, role = brief(value.text) or "nothing", nearest(value.text, ROLES)
+            raise fault("E203", value.location, message, expected, got, role and f"{name}: {role}")
         node = mapping_of(value, message, f"{name}: {{unit: N/m}}")
         if (table := node.get("table")) is not None:
             body = MappingReader(node, TABLE, message, root.mistakes)
@@ -271,8 +271,8 @@ def _unit_and_size(body: MappingReader, name: str) -> tuple[Unit, int]:
     unit = body.read("unit", _unit, None)
     size = body.read("size", partial(_size, name=name, unit=unit.text if unit else "1"), 0)
     if unit is None and "unit" not in body.nodes:
-        fix, advice = f"{name}: {{unit: N/m}}", "use unit: 1 for a plain number"
-        raise fault("E201", body.location, f"{name} has no unit", fix=fix, advice=advice)
+        advice = "add unit, such as unit: N/m, or unit: 1 for a plain number"
+        raise fault("E201", body.location, f"{name} has no unit", advice=advice)
     if unit is None:
         raise AlreadyReportedError
     return unit, size
