@@ -342,7 +342,7 @@ class ComponentNames:
         elif vector in self.dimensions:
             expected, got, fix = "a vector before the index", f"the number {shown}", shown
             if size:
-                expected, got, fix = f"an index from 1 to {size}", f"{index}", entry(shown, size)
+                expected, got, fix = f"an index from 1 to {size}", f"{index}", ""
             mistakes.add("E408", location, entry(shown, index), expected=expected, got=got, fix=fix)
         else:
             message, known = (

@@ -40,7 +40,6 @@ from apc.compiler.language.grammar import MAX_LENGTH
 
 T = TypeVar("T")
 SIZES = (2, 3)
-LONGEST_REPEATED = 20  # characters of the longest number that a message repeats for each entry
 
 # The arguments of an operation that must be numbers, and the arguments that are not expanded.
 NUMBERS: dict[str, tuple[int, ...]] = {
@@ -143,10 +142,12 @@ class _VectorWriter:
     def __init__(self, size_of: SizeOf, text: str, location: SourceLocation) -> None:
         self.size_of, self.text, self.location = size_of, text, location
 
-    def fail(self, code: str, at: Expr, expected: str, got: str = "", fix: str = "") -> NoReturn:
+    def fail(
+        self, code: str, at: Expr, expected: str, got: str = "", fix: str = "", advice: str = ""
+    ) -> NoReturn:
         """Raise an error located at a part of the expression."""
         message, location = as_written(at, self.text), location_in(self.location, self.text, at.start)
-        raise ApcError(Diagnostic(code, location, message, expected, got, fix))
+        raise ApcError(Diagnostic(code, location, message, expected, got, fix, advice))
 
     def written(self, expr: Expr) -> Written:
         """Return the expanded expression: a tuple of entries, or of one number.
@@ -189,8 +190,9 @@ class _VectorWriter:
             equal = [k for k in equal if is_vector[k] or word not in FUNCTIONS]
             self.agree([parts[k] for k in equal], [written[k] for k in equal])
         elif all(is_vector):
-            fix = f"dot({', '.join(map(format_expression, parts))})"
-            self.fail("E407", expr, "at most one vector in a product", "two", fix)
+            left, right = map(format_expression, parts)
+            got, advice = f"two, {left} and {right}", f"the scalar product is dot({left}, {right})"
+            self.fail("E407", expr, "at most one vector in a product", got, advice=advice)
         return self.each(expr, written)
 
     def product(self, expr: Call) -> Written:
@@ -234,9 +236,9 @@ class _VectorWriter:
             model, first = pairs[0]
             if len(first) == len(other):
                 continue
-            text, fix = format_expression(part), "" if _is_vector(first) else self.of_vector(part)
-            if not _is_vector(other) and len(text) <= LONGEST_REPEATED:
-                fix = "{" + ", ".join([text] * len(first)) + "}"
+            fix = "" if _is_vector(first) else self.of_vector(part)
+            if not _is_vector(other):
+                fix = self.of_number(part, len(first))
             self.fail("E406", part, f"{_size(first)} like {as_written(model, self.text)}", _size(other), fix)
 
     def each(self, call: Call, parts: Sequence[Written]) -> Written:
@@ -247,6 +249,19 @@ class _VectorWriter:
         replaced = (part or (argument,) for part, argument in zip(parts, call.arguments, strict=True))
         rows = zip(*(part if _is_vector(part) else part * size for part in replaced), strict=True)
         return tuple(replace(call, arguments=row) for row in rows)
+
+    def of_number(self, expr: Expr, size: int) -> str:
+        """Return the vector to propose instead of a number, empty if there is none.
+
+        Zero is a vector of zeros, and an entry is the vector that it belongs to. No other number determines
+        the direction of a vector.
+        """
+        if isinstance(expr, NumberLiteral) and not expr.value:
+            return "{" + ", ".join("0" * size) + "}"
+        if isinstance(expr, Name):
+            path = (*expr.parts[:-1], whole_and_index(expr.parts[-1])[0])
+            return ".".join(path) if path != expr.parts and self.size_of(path) == size else ""
+        return ""
 
     def of_vector(self, expr: Expr) -> str:
         """Return the text of numbers to propose instead of a vector, empty if there is none."""
