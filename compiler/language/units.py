@@ -164,6 +164,7 @@ NAME = re.compile(r"[^\W\d_²³][^\W²³]*|[%°]")  # as in the grammar
 _NUMBER = r"(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
 _QUANTITY_START = re.compile(rf"\s*[+-]?{_NUMBER}(?:\s*/\s*{_NUMBER})?")
 _EXPONENT = re.compile(r"\^-?[0-9]+|\*\*-?[0-9]+|[²³]")
+_EXAMPLES = "; use a unit such as "  # before the units of the quantity of an unsupported unit
 _NOT_FINITE = re.compile(r"[+-]?\.?(nan|inf|infinity)\b", re.IGNORECASE)
 
 
@@ -256,9 +257,9 @@ def quantity(
     except ApcError as error:
         [mistake] = error.mistakes
         single_name = not set("*/^") & set(text)  # the unit is a single name
-        if single_name and "; supported: " in mistake.message:
-            message, _, supported = mistake.message.partition("; supported: ")
-            if not _is_of(supported.partition(",")[0], requested.dimension):  # of another quantity
+        if single_name and _EXAMPLES in mistake.message:
+            message, _, examples = mistake.message.partition(_EXAMPLES)
+            if not _is_of(re.split(", | or ", examples)[0], requested.dimension):  # of another quantity
                 mistake = replace(mistake, message=message, expected=named)
                 error = ApcError(mistake)
         if mistake.code in ("E223", "E224"):
@@ -503,8 +504,7 @@ class _Units(TREE):
         """Return an exponent. Raises ParseError if it is too large or divides by zero."""
         for part in parts:
             if part.type == "NUMBER" and int(part) > MAX_EXPONENT:
-                expected = f"a whole exponent up to {MAX_EXPONENT}"
-                raise ParseError("E222", part, "unit", expected, str(part))
+                raise ParseError("E222", part, "exponent of a unit", f"at most {MAX_EXPONENT}", str(part))
         try:
             return exponent_of(parts)
         except ZeroDivisionError:
@@ -565,7 +565,8 @@ def _supported_name(name: Token) -> str:
         raise ParseError("E224", name, message, fix="K" if "degree_" in unit else "", subject=name)
     dimension = every.get_dimensionality(unit)
     like = [other for other in COMMON if registry().get_dimensionality(other) == dimension]
-    proposed = f"; supported: {', '.join(like[:3])}" if like else ""
+    *first, last = like[:3] or [""]
+    proposed = _EXAMPLES + (f"{', '.join(first)} or {last}" if first else last) if like else ""
     spelled = f" ({spelled})" if spelled != name else ""
     message = f"unit {name}{spelled} is not supported{proposed}"
     lower = name.lower()
