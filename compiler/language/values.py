@@ -102,17 +102,27 @@ class Bounds:
         """Return the violated bound as text, empty if there is none."""
         least = self.minimum
         if least is not None and (number < least or (self.exclusive_minimum and number == least)):
-            shown = f"{self._shown(least)} {self.unit}"
+            shown = with_unit(self._shown(least), self.unit)
             return f"more than {shown}" if self.exclusive_minimum else f"{shown} or more"
         if self.maximum is not None and number > self.maximum:
-            return f"{self._shown(self.maximum)} {self.unit} or less"
+            return f"{with_unit(self._shown(self.maximum), self.unit)} or less"
         return ""
 
     def check(self, value: ScalarValue, subject: str, mistakes: Mistakes) -> None:
-        """Record an error (E207) for a number out of bounds."""
-        if expected := self.fault(value.number):
-            got = f"{self._shown(value.number)} {self.unit}"
-            mistakes.add("E207", value.location, subject, expected=expected, got=got)
+        """Record an error (E207) for a number out of bounds; the fix omits a sign."""
+        if not self.fault(value.number):
+            return
+        bounds = self
+        if value.unit:  # the bounds in the unit that the user wrote
+            bounds = replace(self, unit=value.unit, scale=parse_unit(value.unit, value.location).scale)
+        expected, got = (
+            bounds.fault(value.number),
+            with_unit(bounds._shown(value.number), bounds.unit),
+        )
+        fix = ""
+        if value.unit and value.expression is None and value.number < 0 and not self.fault(-value.number):
+            fix = got.removeprefix("-") if subject.endswith("]") else f"{subject}: {got.removeprefix('-')}"
+        mistakes.add("E207", value.location, subject, expected=expected, got=got, fix=fix)
 
     def _shown(self, number: Fraction) -> str:
         """Return the text of a number in the unit of messages."""

@@ -26,6 +26,7 @@ from apc.compiler.source import nodes
 from apc.compiler.source.nodes import Node, Scalar, Sequence
 from apc.compiler.source.reading import MappingReader, among, brief, fault, form, mapping_of, text_of, unknown
 from apc.compiler.topology.topology_parameters import NamedNumbers
+from apc.compiler.wording import with_unit
 
 SHAPES = ("complete", "ring", "star")
 
@@ -203,7 +204,10 @@ def _arc(pair: Node, subject: str, index_of: Mapping[str, int], mistakes: Mistak
         number = node.value if isinstance(node, Scalar) else None
         usable = isinstance(number, int | float) and not isinstance(number, bool)
         if not (usable and number and math.isfinite(float(number))):
-            raise fault("E203", node.location, "weight", "a number other than 0", form(node), "0.5")
+            one = subject.removesuffix("s")
+            message = f"weight of {one} [{', '.join(map(form, pair.items[:2]))}]"
+            advice = f"remove the {one}, or give it a weight" if usable and not number else ""
+            raise fault("E203", node.location, message, "a number other than 0", form(node), advice=advice)
         weight = float(number)
     if len(ends) < 2:
         raise AlreadyReportedError
@@ -237,9 +241,11 @@ def read_delays(node: Node, numbers: NamedNumbers) -> tuple[DelayDeclaration, ..
             for inner, value in mapping_of(body, sender, fix).entries:
                 with numbers.mistakes:
                     receiver = among(inner.text, counts, inner.location, subject)
-                    text_of(value, receiver, fix)
-                    delay = numbers.read(value, f"delay from {sender} to {receiver}", SECOND, "ms")
+                    text, message = text_of(value, receiver, fix), f"delay from {sender} to {receiver}"
+                    delay = numbers.read(value, message, SECOND, "ms")
                     if delay.number < 0:
-                        raise fault("E207", delay.location, "delay", "0 s or more", str(delay))
+                        least = with_unit("0", delay.unit or "s")
+                        right = "" if delay.expression else f"{receiver}: {text.strip().removeprefix('-')}"
+                        raise fault("E207", delay.location, message, f"{least} or more", str(delay), right)
                     declarations.append(DelayDeclaration(sender, receiver, delay))
     return tuple(declarations)

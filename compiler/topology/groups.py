@@ -355,8 +355,8 @@ class GroupReader:
             raise fault("E208", node.location, f"list of {subject}", expected, got)
         return np.array(
             [
-                float(self.numbers.read_for(entry_node, subject, declaration).number)
-                for entry_node in node.items
+                float(self.numbers.read_for(entry_node, _of_peer(subject, index), declaration).number)
+                for index, entry_node in enumerate(node.items, 1)
             ]
         )
 
@@ -406,6 +406,11 @@ class GroupReader:
                     values[qualified] = replace(value, number=new_number, location=location)
                     if isinstance(item := self.settable[qualified][0], NumberParameter):
                         item.bounds.check(values[qualified], qualified, self.numbers.mistakes)
+
+
+def _of_peer(subject: str, index: int) -> str:
+    """Return the name of the number of one peer, with an index from 1; an entry of a vector is unchanged."""
+    return subject if subject.endswith("]") else entry(subject, index)
 
 
 def _check_column(

@@ -14,6 +14,7 @@ r = 1-p, 1-h = 1 and 1-k = 0, which make losses independent: `loss: 2 %` is `los
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from fractions import Fraction
@@ -26,7 +27,7 @@ from apc.compiler.compiled import Graph
 from apc.compiler.components.component import Component, Named, Reference
 from apc.compiler.components.component import NumberParameter as Parameter
 from apc.compiler.components.parts import PartEntry
-from apc.compiler.errors import SourceLocation
+from apc.compiler.errors import ApcError, SourceLocation
 from apc.compiler.language.dimensions import DIMENSIONLESS
 from apc.compiler.language.grammar import parse_expression
 from apc.compiler.language.recordings import read_trace
@@ -47,6 +48,7 @@ PROBABILITIES = {
     "1-h": "probability that a bad link loses a packet",
     "1-k": "probability that a good link loses a packet",
 }
+_NUMBER = re.compile(r"\d+(\.\d+)?")
 LOSS_EXAMPLE = "loss: {p: 1 %, r: 25 %}"
 _EXAMPLES = {"loss": "loss: 2 %", "jitter": "jitter: 2 ms", "trace": "trace: delays.csv"}
 # The declaration of each probability of a link's loss model.
@@ -304,10 +306,22 @@ def _loss(link: str, node: Node, numbers: NamedNumbers) -> Named[ScalarValue]:
 
 def _probability(node: Node, subject: str, numbers: NamedNumbers) -> ScalarValue:
     """Return a probability from 0 to 1; raises ApcError (E261) for other numbers."""
-    value = numbers.read(node, subject, DIMENSIONLESS, "%")
+    expected, got = "a probability, 0 % to 100 %", brief(node.text) if isinstance(node, Scalar) else ""
+    try:
+        value = numbers.read(node, subject, DIMENSIONLESS, "%")
+    except ApcError as error:
+        number = _NUMBER.match(got)
+        fix = f"{subject}: {number[0]} %" if number and float(number[0]) <= 100 else ""
+        raise ApcError(
+            replace(mistake, expected=expected, fix=mistake.fix or fix)
+            if mistake.expected == "%"
+            else mistake
+            for mistake in error.mistakes
+        ) from None
     if 0 <= value.number <= 1:
         return value
-    got = brief(node.text) if isinstance(node, Scalar) else ""
     bare = isinstance(node, Scalar) and isinstance(node.value, int | float) and 1 < value.number <= 100
     fix = f"{subject}: {got} %" if bare else ""
-    raise fault("E261", value.location, subject, "a probability, 0 % to 100 %", got, fix)
+    if value.unit and value.expression is None and -1 <= value.number < 0:
+        fix = f"{subject}: {got.removeprefix('-')}"
+    raise fault("E261", value.location, subject, expected, got, fix)
