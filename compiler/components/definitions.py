@@ -57,6 +57,7 @@ from apc.compiler.source.reading import (
     name_of,
     text_of,
     unknown,
+    use,
     whole_number,
 )
 from apc.compiler.source.source import Source
@@ -143,14 +144,18 @@ def _read_declarations(root: MappingReader, library: Definitions, mistakes: Mist
     )
     connectors = _connectors(root, library)
     parameters, variables = read_parameters(root), read_variables(root)
-    used_names = {name for name, _, _ in connectors}
-    for declared in (by_vector(parameters), by_vector(variables)):
+    body = root.nodes.get("connectors")
+    locations = {key.text: key.location for key, _ in body.entries} if isinstance(body, Mapping) else {}
+    used_names = {name: use("a connector", locations[name]) for name, _, _ in connectors}
+    declarations = ("a parameter", by_vector(parameters)), ("a variable", by_vector(variables))
+    for kind, declared in declarations:
         for local, (first, *_) in declared.items():
             if local in used_names:
-                mistakes.add("E205", first.location, f"the name {local} is used twice in this component")
+                message = f"{local} is already the name of {used_names[local]}"
+                mistakes.add("E205", first.location, message)
             if local in RESERVED:
                 mistakes.add("E205", first.location, f"{local} is a reserved word and can't be a name")
-            used_names.add(local)
+            used_names[local] = use(kind, first.location)
     draft = replace(
         base,
         name=title.text,

@@ -57,6 +57,7 @@ from apc.compiler.source.reading import (
     quoted,
     text_of,
     unknown,
+    use,
     value_of,
     whole_number,
 )
@@ -83,6 +84,8 @@ EXAMPLES = {
     "hands": ("hand", "{type: ConstantForce}", "ConstantForce"),
     "parts": ("tip", "{type: Mass}", "Mass"),
 }
+# What a part of a section is called in messages.
+KINDS = {"masses": "a mass", "links": "a link", "couplers": "a coupler", "hands": "a hand", "parts": "a part"}
 SHORTEST_WORD = 4  # letters of a word that is searched in the names of components
 # Other words for an option, as of a distribution.
 _SYNONYMS = {"gauss": "normal", "gaussian": "normal"}
@@ -216,12 +219,12 @@ class PartEntries:
     """The parts of a topology or component, section by section, before their entries are read.
 
     `entries` are the parts with a valid component; `faulty` the names of parts with an error that was
-    reported. `used` are the names that are already used, None inside a component.
+    reported. `used` has the names that are already used, with their `use`; it is None inside a component.
     """
 
     library: Definitions
     mistakes: Mistakes
-    used: set[str] | None = None
+    used: dict[str, str] | None = None
     entries: dict[str, PartEntry] = field(default_factory=dict)
     faulty: set[str] = field(default_factory=set)
 
@@ -234,7 +237,7 @@ class PartEntries:
                 self.faulty.add(key.text)  # removed once the entry is valid
             with self.mistakes:
                 body = mapping_of(value, key.text, f"{key.text}: {example}")
-                name_of(key, subject, self.used or (), "this topology", words)
+                name_of(key, subject, self.used, words)
                 component = self._component(section, key, body)
                 count = None
                 with self.mistakes:
@@ -242,7 +245,7 @@ class PartEntries:
                 self.entries[key.text] = PartEntry(key.text, section, body, component, key.location, count)
                 self.faulty.discard(key.text)
                 if self.used is not None:
-                    self.used.add(key.text)
+                    self.used[key.text] = use(KINDS[section], key.location)
 
     def _component(self, section: str, key: Scalar, body: MappingNode) -> Component:
         """Return the component of an entry. Raises ApcError for a missing or unknown type."""

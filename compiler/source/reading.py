@@ -151,17 +151,15 @@ def whole_number(node: Node) -> int | None:
     return value if isinstance(value, int) and not isinstance(value, bool) else None
 
 
-def name_of(
-    key: Scalar, subject: str, used: Container[str] = (), whole: str = "", words: Container[str] = ()
-) -> str:
+def name_of(key: Scalar, subject: str, used: dict[str, str] | None = None, words: Container[str] = ()) -> str:
     """Return the text of a scalar that is a valid name: a letter, then letters, digits and underscores.
 
     Parameters
     ----------
     key, subject
         The scalar, and the noun for the named item, for the message.
-    used, whole
-        The names already in use, and the text for their context.
+    used
+        The names that are already used, with their `use`.
     words
         The reserved words of the language.
 
@@ -176,9 +174,14 @@ def name_of(
         raise fault("E205", key.location, f"name of {subject}", expected, brief(name) or "nothing")
     if name in words:
         raise fault("E205", key.location, f"{name} is a reserved word and can't be a name")
-    if name in used:
-        raise fault("E205", key.location, f"the name {name} is used twice in {whole}")
+    if used and name in used:
+        raise fault("E205", key.location, f"{name} is already the name of {used[name]}")
     return name
+
+
+def use(kind: str, location: SourceLocation) -> str:
+    """Return what a name is used for, for the message about its second use: `a clock, in line 4`."""
+    return f"{kind}, in line {location.line}" if location.line else kind
 
 
 # Keys of the language before version 0.2, and their names since.

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import re
-from collections.abc import Container
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import partial
@@ -38,7 +37,7 @@ class ClockDeclaration:
 
 
 def read_clocks(
-    root: MappingReader, numbers: NamedNumbers, used: Container[str]
+    root: MappingReader, numbers: NamedNumbers, used: dict[str, str]
 ) -> dict[str, ClockDeclaration]:
     """Return the clocks of a topology by name.
 
@@ -51,12 +50,12 @@ def read_clocks(
     numbers
         The named numbers that the times may depend on.
     used
-        The names already used in the topology, which a clock may not have.
+        The names that are already used in the topology, with their `use`; a clock has none of them.
     """
     result: dict[str, ClockDeclaration] = {}
     for key, value in root.section("clocks", "{haptic: 1 ms}"):
         with root.mistakes:
-            name = name_of(key, "a clock", used, "this topology", RESERVED)
+            name = name_of(key, "a clock", used, RESERVED)
             result[name] = _read_clock(name, value, numbers, root)
     return result
 

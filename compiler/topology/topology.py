@@ -26,7 +26,7 @@ from apc.compiler.files import FileReader, RefusedError
 from apc.compiler.language.csv_tables import NamedFiles
 from apc.compiler.language.values import AlreadyReportedError, ScalarValue
 from apc.compiler.source.nodes import Mapping, Scalar, Sequence
-from apc.compiler.source.reading import MappingReader, brief, fault, mapping_of, text_of
+from apc.compiler.source.reading import MappingReader, brief, fault, mapping_of, text_of, use
 from apc.compiler.source.source import Source
 from apc.compiler.topology.groups import GroupDeclaration, GroupReader, read_counts
 from apc.compiler.topology.instances import PartInstance, PartReader, settable_names
@@ -53,6 +53,7 @@ TOPOLOGY = (
     "experiment",
     "studies",
 )
+KINDS = {"peers": "a group of peers", "parameters": "a parameter", "clocks": "a clock"}
 # The sections that can be nested in another one by their indentation.
 NESTED = (*SECTIONS, "clocks", "parameters", "peers", "experiment", "studies")
 # The required sections, and an example of each.
@@ -186,8 +187,9 @@ def build_topology(source: Source, library: Library) -> Topology:
     counts = {name: bodies[name].count if name in bodies else 2 for name in (*bodies, *group_names)}
     mistakes.names = tuple(counts)
     numbers = read_named_numbers(root, counts, files, complete=complete)
-    clocks = read_clocks(root, numbers, {*numbers.values, *counts})
-    sections = PartEntries(library, mistakes, {*numbers.values, *counts, *clocks})
+    uses = _uses(root, "peers", counts) | _uses(root, "parameters", numbers.values)
+    clocks = read_clocks(root, numbers, uses)
+    sections = PartEntries(library, mistakes, uses | _uses(root, "clocks", clocks))
     for section in SECTIONS:
         sections.read(section, root)
     if "masses" not in root.nodes:
@@ -235,6 +237,13 @@ def build_topology(source: Source, library: Library) -> Topology:
         root.location,
         topology_warnings(parts, links, entries, groups, library.replaced),
     )
+
+
+def _uses(root: MappingReader, section: str, names: Collection[str]) -> dict[str, str]:
+    """Return the use of each of some names that a section defines, for messages about a second use."""
+    node = root.nodes.get(section)
+    entries = node.entries if isinstance(node, Mapping) else ()
+    return {key.text: use(KINDS[section], key.location) for key, _ in entries if key.text in names}
 
 
 def _refuse_nested_section(root: Mapping) -> None:
