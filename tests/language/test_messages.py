@@ -83,12 +83,17 @@ def written(text: str, mistake: str, line: str) -> str:
         lines[row] = before + at.replace(rest.rstrip(), line, 1)
     elif " = " in line:
         lines[row] = before + line
+    elif re.fullmatch(r"-?[\d.]+ [^\s,]+", line):  # a quantity in a list
+        lines[row] = before + re.sub(r"[^,\]}]+", line, at, count=1)
     elif ": " not in line:  # a word, a unit, or what a function is called
         call = r"(\([^()]*\))?" if "(" in line and "(…)" not in line else ""
         word = line.replace("(…)", "").strip('"')
         lines[row] = before + re.sub(rf"\w[\w.]*(\[\d+\][\w.]*)?{call}|\W", word, at, count=1)
-    elif entry.search(before + at):
-        lines[row] = entry.sub(lambda _: line, before + at, count=1)
+    elif found := [*entry.finditer(before + at)]:  # the entry of the value at the column, else the first
+        start, end = next(
+            (m.span() for m in found if before[m.start() :].strip() == f"{key}:"), found[0].span()
+        )
+        lines[row] = (before + at)[:start] + line + (before + at)[end:]
     else:
         lines[row] = before + at.replace("{", f"{{{line}, ", 1)
     return "\n".join(lines) + "\n"
