@@ -28,9 +28,9 @@ from apc.compiler.components.component import (
     Reference,
     Settable,
 )
-from apc.compiler.errors import Mistakes, SourceLocation, nearest
+from apc.compiler.errors import Mistakes, SourceLocation, location_in, nearest
 from apc.compiler.language.dimensions import Dimension
-from apc.compiler.language.expression import format_expression
+from apc.compiler.language.expression import Call, format_expression, walk
 from apc.compiler.language.grammar import parse_expression
 from apc.compiler.language.units import Unit
 from apc.compiler.language.values import (
@@ -46,7 +46,6 @@ from apc.compiler.source.nodes import Node, Scalar
 from apc.compiler.source.reading import (
     IDENTIFIER,
     MappingReader,
-    among,
     brief,
     fault,
     form,
@@ -320,6 +319,21 @@ class EntryScope:
     outer: Component | None = None
 
 
+@dataclass(frozen=True, slots=True)
+class WrittenConnection:
+    """A connection as written, for messages.
+
+    `subject` names the connector and its part; `connector` is the key and `text` the value; `fix` proposes
+    another part, empty if there is none.
+    """
+
+    subject: str
+    connector: str
+    text: str
+    location: SourceLocation
+    fix: str
+
+
 def read_entry(entry: PartEntry, scope: EntryScope, mistakes: Mistakes, index: int = 1) -> PartBindings:
     """Return the values, options, references, start values and connections of a part's entry.
 
@@ -342,7 +356,15 @@ def read_entry(entry: PartEntry, scope: EntryScope, mistakes: Mistakes, index: i
     settable_names = (whole_and_index(item.name)[0] for item in (*component.parameters, *starts))
     common = PART_KEYS if within is None else ("count",)
     keys = dict.fromkeys(("type", *common, *dict(component.connectors), *settable_names))
-    nodes = MappingReader(entry.body, keys, f"{entry.name} ({component.name})", mistakes).nodes
+    body = replace(
+        entry.body,
+        entries=tuple(
+            (key, node)
+            for key, node in entry.body.entries
+            if key.text in keys or not _undeclared_reference(key, node, component, scope, mistakes)
+        ),
+    )
+    nodes = MappingReader(body, keys, f"{entry.name} ({component.name})", mistakes).nodes
     numbers: tuple[NumberParameter | ComponentVariable, ...] = (*component.numbers, *starts)
     for name, vector in by_vector(numbers).items():
         if len(vector) > 1 and name in nodes:  # a key for each entry, x[1], instead of x: [1 m, 0 m]
@@ -407,9 +429,16 @@ def read_entry(entry: PartEntry, scope: EntryScope, mistakes: Mistakes, index: i
             if outer.unit.dimension != item.unit.dimension:
                 raise fault("E204", node.location, name, item.unit.text, outer.unit.text)
             return word
+        known = scope.references(role, word)
+        if word in known:
+            return word
         missing = f"not in {role}s" if within is None else f"not a {role} of {within.name}"
-        message = f"{entry.name}: unknown {role} {{}} ({missing})"
-        return among(word, scope.references(role, word), node.location, message)
+        message = f"{entry.name}: unknown {role} {named(word)} ({missing})"
+        if other := (scope.parts.used or {}).get(word, ""):
+            fix = f"{name}: {next(iter(known))}" if len(known) == 1 else ""
+            got = f"{word}, {other.partition(',')[0]}"
+            raise fault("E206", node.location, f"{name} of {entry.name}", f"a {role}", got, fix)
+        raise unknown("E206", node.location, message, word, known)
 
     def read_all(items: Iterable[Item], read: Callable[[Item], T | None]) -> Named[T]:
         """Return the values of items by name; missing and invalid items are omitted."""
@@ -451,6 +480,43 @@ def read_entry(entry: PartEntry, scope: EntryScope, mistakes: Mistakes, index: i
         read_all(starts, number),
         tuple(connections),
     )
+
+
+def _undeclared_reference(
+    key: Scalar, node: Node, component: Component, scope: EntryScope, mistakes: Mistakes
+) -> bool:
+    """Return whether an entry has a key for a clock or link that its component uses and does not declare.
+
+    The error E504 of the component is recorded: the key of the entry is correct.
+    """
+    for role in ("clock", "link"):
+        if any(isinstance(item, Reference) and item.role == role for item in component.parameters):
+            continue
+        faults = _faults_without(role, component)
+        if faults and isinstance(node, Scalar) and node.text in scope.references(role, ""):
+            location, message = faults
+            advice = f"add {key.text}: {role} to its parameters"
+            mistakes.add("E504", location, message, advice=advice)
+            return True
+    return False
+
+
+def _faults_without(role: str, component: Component) -> tuple[SourceLocation, str] | None:
+    """Return the location and the message of the first use of a clock or link in a component that declares
+    none; None if it uses none.
+    """
+    if role == "link":
+        uses = ((send.location, f"sends {send.name}") for send in component.sends)
+    else:
+        uses = (
+            (location_in(equation.location, equation.text, node.start), "uses sample")
+            for equation in component.equations
+            for side in (equation.left, equation.right)
+            for node in walk(side)
+            if isinstance(node, Call) and node.function == "sample" and len(node.arguments) == 1
+        )
+    found = next(uses, None)
+    return found and (found[0], f"{component.name} {found[1]} but has no {role} parameter")
 
 
 def _vector_nodes(
@@ -537,7 +603,11 @@ def _connection_target(
         raise fault("E210", node.location, f"{connector} of {name}", "another part", name)
     element = _element(part, first, last, entry, index, connector, node.location)
     by_hand = entry.section == "hands"
-    return element, _matching_connector(part, at_connector, connector, kind, by_hand, node.location)
+    free = [known for known in _free_parts(entry, scope, kind) if known != name]
+    subject = f"{connector} of {name}"
+    fix = f"{connector}: {free[0]}" if free else ""
+    written = WrittenConnection(subject, connector, text, node.location, fix)
+    return element, _matching_connector(part, at_connector, written, kind, by_hand)
 
 
 def _free_parts(entry: PartEntry, scope: EntryScope, kind: str) -> list[str]:
@@ -604,7 +674,7 @@ def _element(
 
 
 def _matching_connector(
-    part: PartEntry, written: str | None, connector: str, kind: str, by_hand: bool, at: SourceLocation
+    part: PartEntry, named_connector: str | None, written: WrittenConnection, kind: str, by_hand: bool
 ) -> str:
     """Return the connector of the connected part: the connector named, else the only one of the same type.
 
@@ -612,14 +682,14 @@ def _matching_connector(
     ----------
     part
         The part that is connected.
-    written
+    named_connector
         The name of its connector, None if not written.
-    connector, kind
-        The connector of the entry, and its connector type.
+    written
+        The connection, for messages.
+    kind
+        The connector type of the entry's connector.
     by_hand
         Whether the entry is a hand, which is connected to connectors for hands first.
-    at
-        The place of the connection, for messages.
 
     Raises
     ------
@@ -628,18 +698,26 @@ def _matching_connector(
     """
     shown, fitting = f"{part.name} ({part.component.name})", part.connectors(kind)
     preferred = [name for name in fitting if (name in part.component.grips) == by_hand] or fitting
-    if written is not None:
-        if written in fitting:
-            return written
-        message = f"{shown} has no connector {written} of type {kind}"
-        raise unknown("E206", at, message, written, fitting, f"{part.name}.")
+    if named_connector in fitting:
+        return named_connector
+    if not fitting:
+        got = f"{part.name}, a link" if part.section == "links" else shown
+        expected = f"a part with a connector of type {kind}"
+        raise fault("E210", written.location, written.subject, expected, got, written.fix)
+    if named_connector is not None:
+        message = f"{shown} has no connector {named_connector} of type {kind}"
+        close = nearest(named_connector, fitting)
+        if not close and len(fitting) > 1:
+            raise unknown("E206", written.location, message, named_connector, fitting)
+        fix = f"{written.text.rpartition('.')[0]}.{close or fitting[0]}"
+        fix = f'{written.connector}: "{fix}"' if "[" in fix else fix
+        message += f"; the nearest is {close}" if close else ""
+        raise fault("E206", written.location, message, fix=fix)
     if len(preferred) == 1:
         return preferred[0]
-    message, fix = f"{connector}: expected a part with a connector of type {kind}, got {shown}", ""
-    if fitting:
-        message = f"{shown} has {len(fitting)} connectors of type {kind}"
-        fix = f"{connector}: {part.name}.{fitting[0]}"
-    raise fault("E210", at, message, fix=fix)
+    message = f"{shown} has {len(fitting)} connectors of type {kind}"
+    fix = f"{written.connector}: {part.name}.{fitting[0]}"
+    raise fault("E210", written.location, message, fix=fix)
 
 
 def _single(unit: Unit) -> str:

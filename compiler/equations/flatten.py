@@ -313,7 +313,7 @@ def _flat_peer_type(
         for send in component.sends:
             if writer.link is None:
                 message = f"{component.name} sends {send.name} but has no link parameter"
-                mistakes.add("E504", send.location, message, fix="parameters: {link: link}")
+                mistakes.add("E504", send.location, message, advice="add link: link to its parameters")
                 continue
             expression = writer.written(transform(send.expression, _unsampled), send)
             qualified_name = f"{part.name}.{send.name}"
