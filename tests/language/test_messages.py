@@ -74,6 +74,7 @@ def written(text: str, mistake: str, line: str) -> str:
     row, column = (int(number) - 1 for number in mistake.split(":")[:2])
     before, at, key = lines[row][:column], lines[row][column:], line.partition(": ")[0]
     entry = re.compile(rf"(?<![\w.]){re.escape(key)}: ?{VALUE}")
+    own = max(before.rstrip().rfind(f"{key}:"), 0)  # the key of the value at the column, if it is there
     if (row, column) == (0, 0):  # a section, which may stand anywhere
         return f"{text}{line}\n"
     if "E109" in mistake and line.startswith(", "):
@@ -89,11 +90,8 @@ def written(text: str, mistake: str, line: str) -> str:
         call = r"(\([^()]*\))?" if "(" in line and "(…)" not in line else ""
         word = line.replace("(…)", "").strip('"')
         lines[row] = before + re.sub(rf"\w[\w.]*(\[\d+\][\w.]*)?{call}|\W", word, at, count=1)
-    elif found := [*entry.finditer(before + at)]:  # the entry of the value at the column, else the first
-        start, end = next(
-            (m.span() for m in found if before[m.start() :].strip() == f"{key}:"), found[0].span()
-        )
-        lines[row] = (before + at)[:start] + line + (before + at)[end:]
+    elif found := entry.match(before + at, own) or entry.search(before + at):
+        lines[row] = (before + at)[: found.start()] + line + (before + at)[found.end() :]
     else:
         lines[row] = before + at.replace("{", f"{{{line}, ", 1)
     return "\n".join(lines) + "\n"
