@@ -15,7 +15,8 @@ from dataclasses import dataclass, field
 from apc.compiler.equations.divisor_test import Divisors
 from apc.compiler.equations.flatten import FlatEquation
 from apc.compiler.equations.terms import NoDerivativeError, Symbol, Term, symbol
-from apc.compiler.errors import ApcError, Diagnostic, Mistakes, SourceLocation
+from apc.compiler.errors import ApcError, Diagnostic, Mistakes, SourceLocation, location_in
+from apc.compiler.language.constants import undefined_constant
 
 Assignment = tuple[str, Term]  # an unknown, and the expression of its value
 MOST_LISTED = 8  # equations or unknowns in one message
@@ -62,9 +63,15 @@ class Problem:
         return ApcError(Diagnostic(code, location, message, advice=advice))
 
     def no_number(self, residuals: Sequence[Residual]) -> ApcError:
-        """Return the error E512: equations with a constant that is not a number, possibly after
-        substitution.
+        """Return the error E512: equations with a constant that is not a number.
+
+        The message names the constant, or the equations if the constant results from substitution.
         """
+        for written in (residual.equation.written for residual in residuals):
+            for side in () if written is None else (written.left, written.right):
+                if found := undefined_constant(side, written.text):
+                    location = location_in(written.location, written.text, found[0].start)
+                    return ApcError(Diagnostic("E512", location, found[1]))
         holds = f"{listed(residuals)} {'has' if len(residuals) == 1 else 'have'}"
         return self.fault("E512", residuals, f"{holds} an undefined or too large constant")
 

@@ -1,19 +1,30 @@
 """Bounds on constants in equations, checked before any exact computation.
 
-Takes: the sides of equations. Gives: `check_constants`.
+Takes: the sides of equations. Gives: `check_constants`; `undefined_constant`, for a message.
 Guarantees: a checked equation has no constant whose exact value has more than MOST_BITS bits, and no constant
 outside the range of floats.
-Does not: refuse constants without a real value, such as 1/0 (see `equations.terms`).
+Does not: refuse constants without a real value, such as 1/0 in a branch that is never selected (see
+`equations.terms`).
 """
 
 from __future__ import annotations
 
 import math
+import sys
+from collections.abc import Iterator
 from fractions import Fraction
 
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation, location_in
 from apc.compiler.language.evaluation import EvaluationError, constant_value
-from apc.compiler.language.expression import Call, Expr, Name, NumberLiteral, children, format_expression
+from apc.compiler.language.expression import (
+    Call,
+    Expr,
+    Name,
+    NumberLiteral,
+    as_written,
+    children,
+    format_expression,
+)
 from apc.compiler.source.reading import brief
 
 # The largest number of bits of the coefficients of powers and products: nested powers can reach 2^10^6.
@@ -79,6 +90,49 @@ def check_constants(expression: Expr, text: str, location: SourceLocation) -> No
 
     bits(expression)
     is_constant(expression)
+
+
+def undefined_constant(expression: Expr, text: str) -> tuple[Expr, str] | None:
+    """Return the first constant without a finite real value, from the inside out, and the reason as text.
+
+    The result is None if each constant has a value as written.
+
+    Parameters
+    ----------
+    expression, text
+        One side of an equation, and the equation as written.
+    """
+    for part in children(expression):
+        if (found := undefined_constant(part, text)) is not None:
+            return found
+    if not isinstance(expression, Call):
+        return None
+    try:
+        constant_value(expression)
+        if expression.function == "/" and constant_value(expression.arguments[1]) == 0:
+            return expression, f"{_shown(expression, text)} divides by zero"
+    except EvaluationError as error:
+        return error.node, f"{_shown(error.node, text)} {error.words}"
+    factors = [factor for factor in _factors(expression) if isinstance(factor, NumberLiteral)]
+    if math.prod(factor.value for factor in factors) > sys.float_info.max:
+        shown = "*".join(map(format_expression, factors))
+        return factors[0], f"{brief(shown)} is too large for a number"
+    return None
+
+
+def _shown(expression: Expr, text: str) -> str:
+    """Return the text of a part of an equation without enclosing parentheses."""
+    written = as_written(expression, text)
+    return brief(format_expression(expression) if written.startswith("(") else written)
+
+
+def _factors(expression: Expr) -> Iterator[Expr]:
+    """Yield the factors of a product, in order; signs are omitted."""
+    if isinstance(expression, Call) and expression.function in ("*", "neg"):
+        for part in expression.arguments:
+            yield from _factors(part)
+    else:
+        yield expression
 
 
 def _is_tiny(value: Fraction | float) -> bool:
