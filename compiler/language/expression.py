@@ -91,6 +91,10 @@ FUNCTIONS: dict[str, tuple[int, int]] = {
     "min": (1, 16),
 }
 
+# The functions whose value varies with time or between peers: a parameter has none of them.
+IN_EQUATIONS = frozenset(
+    ("der", "previous", "initial", "age", "mean", "sum", "count", "interval", "interpolate", "sample", "hold")
+)
 KEYWORDS = frozenset(("if", "then", "elseif", "else", "and", "or", "not"))
 
 

@@ -27,6 +27,7 @@ from apc.compiler.errors import SourceLocation, nearest
 from apc.compiler.language.expression import (
     CONDITIONS,
     FUNCTIONS,
+    IN_EQUATIONS,
     KEYWORDS,
     PI,
     Call,
@@ -169,6 +170,9 @@ def _grammar() -> Callable[[str, str], Any]:
 def _refuse_character(text: str, at: int) -> NoReturn:
     """Raise ParseError (E321) for an invalid character, with a fix if there is a usual replacement."""
     character = text[at]
+    index = re.match(r"\[\s*([^\]]*[^\]\s])\s*\]", text[at:])
+    if index and re.search(r"\w\Z", text[:at]):
+        raise ParseError("E321", at, "index", "a whole number, as in finger[2]", cut(index[1]))
     if character in _UNEXPECTED:
         got = "quote" if character in "'\"" else character
         raise ParseError("E321", at, f"unexpected {got}: {_UNEXPECTED[character]}")
@@ -307,7 +311,8 @@ class _Trees(TREE):
             close = _SYNONYMS.get(token) or nearest(token, FUNCTIONS, similarity=SIMILAR)
             message = f"unknown function {cut(token)}"
             if not close:
-                message += f"; available: {', '.join(sorted(FUNCTIONS))}"
+                message += f"; available: {', '.join(sorted({*FUNCTIONS} - IN_EQUATIONS))}, and in equations "
+                message += ", ".join(sorted(IN_EQUATIONS))
             raise ParseError("E325", token, message, fix=close)
         return token
 

@@ -177,6 +177,7 @@ def read_binding(
     if number is None:
         _refuse_marks(text, location, subject)
         _refuse_computed(text, location, subject, unit)
+        _refuse_reciprocal(text, location, subject, unit, names_known)
         if not is_quantity(text):
             location = text_location(node)
             tree = _tree(text, location)
@@ -187,7 +188,7 @@ def read_binding(
                 expected = "a plain number" if unit == "1" else unit
                 raise fault("E204", location, subject, expected, f"{brief(text)}, which {got}", fix, advice)
             return ValueBinding(None, tree, dimension, location)
-        _refuse_trailing(text, location, subject, names_known)
+        _refuse_trailing(text, location, subject, names_known, unit, known)
         _refuse_mixture(text, location, subject, names_known)
         parsed = quantity(text, location, subject=subject, unit=unit)
         number, written_unit = parsed.value, parsed.unit.text
@@ -221,21 +222,59 @@ def _refuse_computed(text: str, location: SourceLocation, subject: str, unit: st
         raise fault("E204", location, subject, _ONE_NUMBER, brief(text), fix)
 
 
+# A number, a slash and a unit.
+_RECIPROCAL = re.compile(r"([+-]?[\d.]+(?:[eE][+-]?\d+)?)\s*/\s*([A-Za-z]\w*)")
+
+
+def _refuse_reciprocal(
+    text: str, location: SourceLocation, subject: str, unit: str, names_known: Collection[str]
+) -> None:
+    """Raise ApcError for a number divided by a unit, such as 5 /s; its unit is written 1/s."""
+    match = _RECIPROCAL.fullmatch(text.strip())
+    if match is None or match[2] not in COMMON or match[2] in names_known:
+        return
+    right = f"{match[1]} 1/{match[2]}"
+    try:
+        quantity(right, location, subject=subject, unit=unit)
+    except ApcError as error:
+        raise ApcError(replace(mistake, got=brief(text)) for mistake in error.mistakes) from None
+    raise fault("E204", location, subject, "a numerator before /", brief(text), f"{subject}: {right}")
+
+
 # A number next to a word, without a sign between them.
 _BESIDE = re.compile(r"(?P<number>[+-]?[\d.]+(?:[eE][+-]?\d+)?)\s*(?P<rest>\(*(?P<word>[A-Za-z]\w*))")
 
 
-def _refuse_trailing(text: str, location: SourceLocation, subject: str, names_known: Collection[str]) -> None:
-    """Raise ApcError for a number next to a name without an operator, such as 2pi*f."""
+def _refuse_trailing(
+    text: str,
+    location: SourceLocation,
+    subject: str,
+    names_known: Collection[str],
+    unit: str = "",
+    known: Callable[[tuple[str, ...]], Dimension | None] = lambda _: None,
+) -> None:
+    """Raise ApcError for a number next to a name without an operator, such as 2pi*f.
+
+    If the number is in `unit`, a product without a unit has advice instead of a fix; `known` returns the
+    dimension of a name.
+    """
     implicit_product = _BESIDE.match(text.strip())
     if implicit_product is None or implicit_product["word"] not in {*names_known, "pi", *FUNCTIONS}:
         return
     with Mistakes():
         parse_unit(implicit_product["word"], location)
         return
-    fix = f"{subject}: {implicit_product['number']}*{text.strip()[implicit_product.start('rest') :]}"
+    right = f"{implicit_product['number']}*{text.strip()[implicit_product.start('rest') :]}"
+    fix, advice = f"{subject}: {right}", ""
+    if unit not in ("", "1"):
+        with Mistakes():
+            if (
+                _dimension(_tree(right, location), right, location, subject, known, names_known)
+                == DIMENSIONLESS
+            ):
+                fix, advice = "", f"multiply {right} by a parameter in {unit}"
     expected = f"* between {implicit_product['number']} and {implicit_product['word']}"
-    raise fault("E204", location, subject, expected, brief(text), fix)
+    raise fault("E204", location, subject, expected, brief(text), fix, advice)
 
 
 def _refuse_mixture(text: str, location: SourceLocation, subject: str, names_known: Collection[str]) -> None:
