@@ -22,6 +22,7 @@ T = TypeVar("T")
 D = TypeVar("D")
 
 MOST_OFFERED = 2  # values of a list that are offered instead of the list
+_NUMBER = re.compile(r"\A\s*[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?(?=\s|\Z)")
 IDENTIFIER = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,62}\Z")
 
 
@@ -130,10 +131,11 @@ def _texts_in(node: Node) -> list[str]:
     return [item.text for item in items if isinstance(item, Scalar) and item.text.strip()]
 
 
-def list_of(node: Node, subject: str, size: int, item: str) -> tuple[Node, ...]:
+def list_of(node: Node, subject: str, size: int, item: str, key: str | None = None) -> tuple[Node, ...]:
     """Return the items of a list node with `size` items; `item` is an example for the message.
 
-    Raises E203. The fix repeats the last value of the node, or omits the values that are too many.
+    Raises E203. The fix adds zeros, or repeats the last value of the node, or omits the values that are too
+    many; `key` is the key of the value in the fix, the subject by default; without a key there is no fix.
     """
     if isinstance(node, Sequence) and len(node.items) == size:
         return node.items
@@ -141,7 +143,11 @@ def list_of(node: Node, subject: str, size: int, item: str) -> tuple[Node, ...]:
     texts = [node.text] if isinstance(node, Scalar) and node.text.strip() else _texts_in(node)
     if isinstance(node, Mapping) or not texts:
         texts = [item]
-    fix = f"{subject}: [{', '.join((texts + texts[-1:] * size)[:size])}]"
+    zero, found = _NUMBER.subn("0", texts[-1], count=1)
+    fillers = dict.fromkeys([zero, texts[-1]] if found and not isinstance(node, Mapping) else texts[-1:])
+    lists = (f"[{', '.join((texts + [filler] * size)[:size])}]" for filler in fillers)
+    key = subject if key is None else key
+    fix = ", or ".join(f"{key}: {text}" for text in dict.fromkeys(lists)) if key else ""
     raise fault("E203", node.location, subject, f"a list of {size} values", got, fix)
 
 

@@ -210,7 +210,7 @@ class GroupReader:
     redeclared: Mapping[str, Collection[str]]
     clocks: Collection[str]
     numbers: NamedNumbers
-    explain: Callable[[str, SourceLocation], None]
+    explain: Callable[[str, SourceLocation, str, str], None]
 
     def read(self, group: GroupBody) -> GroupDeclaration:
         """Return the declaration of a group: its settings, and the numbers that depend on them."""
@@ -231,7 +231,10 @@ class GroupReader:
                     raise fault("E206", key.location, f"{whole}, not a parameter", fix=fix)
                 if listed := [name for name in self.settable if name.startswith(f"{key.text}.")]:
                     raise unknown("E206", key.location, f"{whole}, not a parameter", "", listed)
-                item, qualified_names = self._settable(key.text, key.location, group.name, "E206", message)
+                value = node.text if isinstance(node, Scalar) else "…"
+                item, qualified_names = self._settable(
+                    key.text, key.location, group.name, "E206", message, value
+                )
                 if isinstance(item, Option | Reference):
                     words |= dict.fromkeys(qualified_names, self._word(node, key.text, item))
                 elif isinstance(node, Sequence):
@@ -272,7 +275,7 @@ class GroupReader:
         return [part for part in self.parts if group.name in part.groups]
 
     def _settable(
-        self, name: str, location: SourceLocation, group: str, code: str, message: str
+        self, name: str, location: SourceLocation, group: str, code: str, message: str, value: str = "…"
     ) -> tuple[Settable, list[str]]:
         """Return the declaration of a settable name, and the qualified names it represents.
 
@@ -282,6 +285,8 @@ class GroupReader:
             The name, its location, and the group that sets it.
         code, message
             The error for an unknown name. A heading of a table (E702) can name only a number.
+        value
+            The value as written, for messages.
 
         Raises
         ------
@@ -295,7 +300,7 @@ class GroupReader:
         )
         declaration, qualified_names = self.settable.get(name, (None, []))
         if not isinstance(declaration, kinds):
-            self.explain(name, location)
+            self.explain(name, location, group, value)
             known = [written for written, (other, _) in self.settable.items() if isinstance(other, kinds)]
             known += [f"{part.name}.type" for part in self.parts if code == "E206" and "." not in part.name]
             raise unknown(code, location, message, name, known)
@@ -331,7 +336,12 @@ class GroupReader:
                 self.numbers.mistakes.add("E201", node.location, message, fix="count: 3")
             with self.numbers.mistakes:
                 rows = node.items if nested and isinstance(node, Sequence) else (node,)
-                columns = zip(*(list_of(row, key.text, size, text) for row in rows), strict=True)
+                subjects = [entry(key.text, k + 1) for k in range(len(rows))] if nested else [key.text]
+                vectors = (
+                    list_of(row, subject, size, text, "" if nested else key.text)
+                    for row, subject in zip(rows, subjects, strict=True)
+                )
+                columns = zip(*vectors, strict=True)
                 for name, column in zip(entries(key.text, size), columns, strict=True):
                     yield replace(key, text=name), Sequence(column, node.location) if nested else column[0]
 

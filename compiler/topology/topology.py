@@ -315,14 +315,17 @@ class _Names:
         part = re.split(r"[.\[]", name)[0]
         return part in self.sections.faulty or (not self.complete and part not in self.sections.entries)
 
-    def explain(self, name: str, location: SourceLocation) -> None:
+    def explain(self, name: str, location: SourceLocation, group: str, value: str) -> None:
         """Raise the specific error of a name `part.parameter` that a group can't set, if there is one.
+
+        `value` is the value as written.
 
         Raises ApcError for a parameter of a link, AlreadyReportedError for a part whose error was reported.
         """
         link, _, parameter = name.partition(".")
         if link in self.links:
-            example = f"{link}: {{delays: {{{self.groups[0]}: {{{self.groups[-1]}: 12 ms}}}}}}"
+            other = next((name for name in reversed(self.groups) if name != group), group)
+            example = f"{link}: {{delays: {{{group}: {{{other}: {value}}}}}}}"
             message = f"{name} belongs to a link and can't be set by a group"
             advice = f"set it in links, as in {example}"
             raise fault("E211", location, message, advice=advice if parameter == "delay" else "")
