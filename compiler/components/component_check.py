@@ -237,15 +237,25 @@ class ComponentNames:
         for received in names(send.expression):
             if received.parts[0] == OTHERS:
                 name = next(text for n in count(1) if (text := f"sent{n}",) not in self.dimensions)
-                message = (
-                    f"{send.name} is sent at ticks of the link, but {format_expression(received)} is "
-                    "received at"
-                )
+                shown, clocks = format_expression(received), self._references("clock")
+                message = f"{send.name} is on the clock of the link, and {shown} on the clock of the part"
+
+                def with_clock(node: Expr) -> Expr | None:
+                    """Return a sample with the first of several clocks, None if a node remains."""
+                    if isinstance(node, Call) and node.function == "sample" and len(node.arguments) == 1:
+                        return replace(node, arguments=(*node.arguments, Name((clocks[0],))))  # noqa: B023
+                    return None
+
+                text = send.text
+                if len(clocks) > 1:
+                    text = format_expression(transform(send.expression, with_clock))
                 sample = f"{{{send.name}: sample(hold({name}))}}"
-                advice = f"add the equation {name} = {send.text} and use sends: {sample}"
-                raise fault(
-                    "E505", _location(send, received), f"{message} ticks of the part's clock", advice=advice
-                )
+                advice = f"add the equation {name} = {text} and use sends: {sample}"
+                raise fault("E505", _location(send, received), message, advice=advice)
+
+    def _references(self, role: str) -> list[str]:
+        """Return the names of the parameters with a role, such as the clocks, in alphabetical order."""
+        return sorted(p.name for p in self.component.parameters if getattr(p, "role", "") == role)
 
     def _without_options_and_clocks(self, expression: Expr) -> Expr:
         """Return the expression without items that have no dimension: words of options, and clocks in
@@ -338,7 +348,13 @@ class ComponentNames:
         if parts[0] == OTHERS:
             sent = brief(".".join(vector[1:]))
             message = f"{self.component.name} does not send a value {sent}"
-            mistakes.add("E303", location, message, fix=f"sends: {{{sent}: sample({self.example_of(sent)})}}")
+            value = f"{sent}: sample({self.example_of(sent)})"
+            advice = f"add the section sends: {{{value}}}"
+            if self.component.sends:
+                advice = f"add {value} to sends"
+            elif not self._references("link"):
+                advice += ", and link: link to parameters"
+            mistakes.add("E303", location, message, advice=advice)
         elif vector in self.dimensions:
             expected, got, fix = "a vector before the index", f"the number {shown}", shown
             if size:
