@@ -213,10 +213,14 @@ def check_links(topology: Topology, peer_types: Sequence[PeerType], indices: Seq
             if send.link == link.name
         ]
         every = [channel for _, channels in sent for channel in channels]
-        missing = ((name, text) for text in every for name, channels in sent if text not in channels)
-        for name, channel in islice(missing, 1):
-            message = f"{channel} is sent over {link.name}, over which the peers of {name} send other values"
-            advice = "use a separate link for it"
+        missing = (text for text in every if not all(text in channels for _, channels in sent))
+        for channel in islice(missing, 1):
+            senders = enumerated([name for name, channels in sent if channel in channels])
+            message = (
+                f"only the peers of {senders} send {channel} over {link.name}; all peers must send the same "
+                "values over a link"
+            )
+            advice = f"use a separate link in {channel.rpartition('.')[0]}"
             mistakes.add("E215", link.location, message, advice=advice)
     mistakes.raise_if_any()
     groups, counts = topology.groups, [group.count for group in topology.groups]

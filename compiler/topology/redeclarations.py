@@ -82,12 +82,11 @@ def _redeclared_entry(
         raise fault("E210", node.location, message)
     if _connectors(new) != _connectors(old):
         pairs = ((new, old), (old, new))  # a component, and the one with a connector that it has not
-        texts = [
-            f"{one.name} has no connector {more}" for one, other in pairs if (more := _additional(other, one))
-        ]
-        other_order = ["the connectors have another order"]
-        message = f"{key.text}: {new.name} can't replace {old.name}: {enumerated(texts or other_order)}"
-        raise fault("E210", node.location, message)
+        texts = [f"only {one.name} has {more}" for one, other in pairs if (more := _additional(one, other))]
+        difference = enumerated(texts or ["the connectors have another order"])
+        message = f"{key.text}: {new.name} can't replace {old.name}, as their connectors differ: {difference}"
+        advice = f"define a second part of type {new.name}, with at"
+        raise fault("E210", node.location, message, advice=advice)
     units = {number.name: number.unit for number in old.numbers}
     for number in new.numbers:
         before = units.get(number.name, number.unit)
