@@ -94,10 +94,10 @@ def times_in_use(
     for name, delay in delays.items():
         if delay < 0:
             formulas = (timing.formula for timing in system.timings if timing.name == name)
-            formula, got = next(formulas, None), f"{float(delay):g} s"
+            formula, got = next(formulas, None), f"{1000 * float(delay):g} ms"
             shown = f"delay {formula.text} of a hold" if formula and name.startswith("delay of ") else name
             raise ApcError(
-                Diagnostic("E809", SourceLocation(system.origin.topology), shown, "0 s or more", got)
+                Diagnostic("E809", SourceLocation(system.origin.topology), shown, "0 ms or more", got)
             )
     if not clocks:  # nothing is sampled: any frame will do
         clocks = dict(clock_of) or {"": Clock("", "", "")}
