@@ -350,7 +350,7 @@ class ComponentNames:
             message = f"{self.component.name} does not send a value {sent}"
             value = f"{sent}: sample({self.example_of(sent)})"
             advice = f"add the section sends: {{{value}}}"
-            if self.component.sends:
+            if any(path[0] == OTHERS and len(path) > 1 for path in self.dimensions):
                 advice = f"add {value} to sends"
             elif not self._references("link"):
                 advice += ", and link: link to parameters"

@@ -177,7 +177,7 @@ def _count(name: str, body: MappingReader, table: Table | None, computed: Scalar
         count = int(computed.number) if computed.number.denominator == 1 else None
         got += f", which is {float(computed.number):.12g}"
     if count is None or not 1 <= count <= LARGEST_COUNT:
-        expected = f"a whole number from 1 to {LARGEST_COUNT}"
+        expected = f"a whole number from 1 to {LARGEST_COUNT:,}"
         raise fault("E208", node.location, "count", expected, got, _nearest_counts(node))
     if table is not None and table.rows != count:
         message = f"group {name} has a count of {count} and a table of {table.rows} rows"
