@@ -21,6 +21,7 @@ from apc.compiler.wording import enumerated
 from apc.linearization.linear_subsystem import LinearSubsystem
 from apc.timing.liveness import ReceptionPattern, live_holds
 
+NEAREST = Fraction(1, 100)  # relative change of a period that is proposed: larger ones are other designs
 MOST_TICKS = 20_000  # in a frame: each is a step of the lifting
 
 
@@ -140,7 +141,7 @@ def _check_frame_length(
         clocks = [f"{name} {float(value) * 1e3:.9g} ms" for name, value in period.items() if name]
         message = (
             f"the frame (common period of {enumerated(clocks)}) is {float(frame * quantum):.6g} s with "
-            f"{ticks} ticks; the limit is {MOST_TICKS}"
+            f"{ticks:,} ticks; the limit is {MOST_TICKS:,}"
         )
         fix, advice = "", "use periods that are simple multiples of each other"
         odd = max(system.clocks, key=lambda clock: period.get(clock.name, Fraction(0)).denominator)
@@ -150,8 +151,38 @@ def _check_frame_length(
             periods = (1000 * frame * quantum / ticks for ticks in fits)
             short = (f"{float(ms):g} ms" for ms in periods if Fraction(f"{float(ms):.3g}") == ms)
             fix = f"{fastest}: {next(short, f'{frame * quantum / fits[0]} s')}"
+            least = f"{float(1000 * frame * quantum / fits[0]):.6g} ms"
+            advice = f"the shortest period of {fastest} in this frame is {least}"
+        elif period.get(odd.name) and (ms := _rounded(period, odd.name)):
+            fix, advice = f"{odd.name}: {ms} ms", ""
         location = SourceLocation(system.origin.topology, odd.line, odd.column)
-        raise ApcError(Diagnostic("E805", location, message, fix=fix, advice="" if fix else advice))
+        raise ApcError(Diagnostic("E805", location, message, fix=fix, advice=advice))
+
+
+def _rounded(periods: Mapping[str, Fraction], name: str) -> str:
+    """Return a period in ms, rounded to as many digits as the limit of ticks in a frame permits.
+
+    The result is empty if the period would change by more than `NEAREST`.
+
+    Parameters
+    ----------
+    periods
+        The period of each clock, in seconds.
+    name
+        The clock whose period is rounded.
+    """
+    given = periods[name]
+    for digits in (3, 2, 1):
+        text = f"{float(1000 * given):.{digits}g}"
+        rounded = Fraction(text) / 1000
+        changed = [*(period for other, period in periods.items() if other != name), rounded]
+        frame = common_multiple(changed)
+        if (
+            abs(rounded - given) <= NEAREST * given
+            and sum(frame / period for period in changed) <= MOST_TICKS
+        ):
+            return f"{float(text):g}"
+    return ""
 
 
 def _fastest_that_fits(period_quanta: Mapping[str, int], frame: int) -> range:
