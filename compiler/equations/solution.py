@@ -67,8 +67,8 @@ class Problem:
 
         The message names the constant, or the equations if the constant results from substitution.
         """
-        for written in (residual.equation.written for residual in residuals):
-            for side in () if written is None else (written.left, written.right):
+        for written in filter(None, (residual.equation.written for residual in residuals)):
+            for side in (written.left, written.right):
                 if found := undefined_constant(side, written.text):
                     location = location_in(written.location, written.text, found[0].start)
                     return ApcError(Diagnostic("E512", location, found[1]))

@@ -231,9 +231,9 @@ class GroupReader:
                     raise fault("E206", key.location, f"{whole}, not a parameter", fix=fix)
                 if listed := [name for name in self.settable if name.startswith(f"{key.text}.")]:
                     raise unknown("E206", key.location, f"{whole}, not a parameter", "", listed)
-                value = node.text if isinstance(node, Scalar) else "…"
+                given = node.text if isinstance(node, Scalar) else "…"
                 item, qualified_names = self._settable(
-                    key.text, key.location, group.name, "E206", message, value
+                    key.text, key.location, group.name, "E206", message, given
                 )
                 if isinstance(item, Option | Reference):
                     words |= dict.fromkeys(qualified_names, self._word(node, key.text, item))
