@@ -85,6 +85,7 @@ EXAMPLES = {
 }
 # What a part of a section is called in messages.
 KINDS = {"masses": "a mass", "links": "a link", "couplers": "a coupler", "hands": "a hand", "parts": "a part"}
+MOST_CHOICES = 12  # names that a message lists
 SHORTEST_WORD = 4  # letters of a word that is searched in the names of components
 # Other words for an option, as of a distribution.
 _SYNONYMS = {"gauss": "normal", "gaussian": "normal"}
@@ -437,7 +438,8 @@ def read_entry(entry: PartEntry, scope: EntryScope, mistakes: Mistakes, index: i
         if other := (scope.parts.used or {}).get(word, ""):
             fix = f"{name}: {next(iter(known))}" if len(known) == 1 else ""
             got = f"{word}, {other.partition(',')[0]}"
-            raise fault("E206", node.location, f"{name} of {entry.name}", f"a {role}", got, fix)
+            choice = f"a {role}" if fix else f"a {role} ({', '.join([*known][:MOST_CHOICES])})"
+            raise fault("E206", node.location, f"{name} of {entry.name}", choice, got, fix)
         raise unknown("E206", node.location, message, word, known)
 
     def read_all(items: Iterable[Item], read: Callable[[Item], T | None]) -> Named[T]:

@@ -267,6 +267,10 @@ def _refuse_trailing(
     right = f"{implicit_product['number']}*{text.strip()[implicit_product.start('rest') :]}"
     fix, advice = f"{subject}: {right}", ""
     if unit not in ("", "1"):
+        try:
+            _refuse_computed(right, location, subject, unit)
+        except ApcError as error:  # a product of numbers with a unit
+            raise ApcError(replace(mistake, got=brief(text)) for mistake in error.mistakes) from None
         with Mistakes():
             if (
                 _dimension(_tree(right, location), right, location, subject, known, names_known)
