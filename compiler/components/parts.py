@@ -711,8 +711,8 @@ def _matching_connector(
         close = nearest(named_connector, fitting)
         if not close and len(fitting) > 1:
             raise unknown("E206", written.location, message, named_connector, fitting)
-        fix = f"{written.text.rpartition('.')[0]}.{close or fitting[0]}"
-        fix = f'{written.connector}: "{fix}"' if "[" in fix else fix
+        target = f"{written.text.rpartition('.')[0]}.{close or fitting[0]}"
+        fix = f'{written.connector}: "{target}"' if "[" in target else target
         message += f"; the nearest is {close}" if close else ""
         raise fault("E206", written.location, message, fix=fix)
     if len(preferred) == 1:
