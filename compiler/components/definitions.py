@@ -52,12 +52,12 @@ from apc.compiler.source.reading import (
     among,
     brief,
     fault,
+    first_use,
     form,
     mapping_of,
     name_of,
     text_of,
     unknown,
-    use,
     whole_number,
 )
 from apc.compiler.source.source import Source
@@ -146,7 +146,7 @@ def _read_declarations(root: MappingReader, library: Definitions, mistakes: Mist
     parameters, variables = read_parameters(root), read_variables(root)
     body = root.nodes.get("connectors")
     locations = {key.text: key.location for key, _ in body.entries} if isinstance(body, Mapping) else {}
-    used_names = {name: use("a connector", locations[name]) for name, _, _ in connectors}
+    used_names = {name: first_use("a connector", locations[name]) for name, _, _ in connectors}
     declarations = ("a parameter", by_vector(parameters)), ("a variable", by_vector(variables))
     for kind, declared in declarations:
         for local, (first, *_) in declared.items():
@@ -155,7 +155,7 @@ def _read_declarations(root: MappingReader, library: Definitions, mistakes: Mist
                 mistakes.add("E205", first.location, message)
             if local in RESERVED:
                 mistakes.add("E205", first.location, f"{local} is a reserved word and can't be a name")
-            used_names[local] = use(kind, first.location)
+            used_names[local] = first_use(kind, first.location)
     draft = replace(
         base,
         name=title.text,

@@ -48,6 +48,7 @@ from apc.compiler.source.reading import (
     MappingReader,
     brief,
     fault,
+    first_use,
     form,
     list_of,
     mapping_of,
@@ -56,7 +57,6 @@ from apc.compiler.source.reading import (
     quoted,
     text_of,
     unknown,
-    use,
     value_of,
     whole_number,
 )
@@ -245,7 +245,7 @@ class PartEntries:
                 self.entries[key.text] = PartEntry(key.text, section, body, component, key.location, count)
                 self.faulty.discard(key.text)
                 if self.used is not None:
-                    self.used[key.text] = use(KINDS[section], key.location)
+                    self.used[key.text] = first_use(KINDS[section], key.location)
 
     def _component(self, section: str, key: Scalar, body: MappingNode) -> Component:
         """Return the component of an entry. Raises ApcError for a missing or unknown type."""

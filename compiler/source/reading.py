@@ -2,7 +2,7 @@
 
 Takes: nodes of the stage `source`. Gives: `MappingReader`, a mapping that is read key by key; `mapping_of`,
 `list_of`, `text_of`, `value_of`, `name_of`, `whole_number`, `among`; for messages `fault`, `unknown`, `form`,
-`brief`, `named`, `quoted`, `either_comma`.
+`brief`, `named`, `quoted`, `either_comma`, `first_use`.
 Guarantees: a node of the wrong form is one mistake, an `ApcError` that `with mistakes:` records, so that
 the following nodes are read.
 Does not: handle sections, components or units.
@@ -132,10 +132,23 @@ def _texts_in(node: Node) -> list[str]:
 
 
 def list_of(node: Node, subject: str, size: int, item: str, key: str | None = None) -> tuple[Node, ...]:
-    """Return the items of a list node with `size` items; `item` is an example for the message.
+    """Return the items of a list node with `size` items.
 
-    Raises E203. The fix adds zeros, or repeats the last value of the node, or omits the values that are too
-    many; `key` is the key of the value in the fix, the subject by default; without a key there is no fix.
+    Parameters
+    ----------
+    node, subject
+        The node, and its name in messages.
+    size
+        The required number of items.
+    item
+        An example of an item, for the message.
+    key
+        The key of the value in the fix, by default the subject; with an empty key there is no fix.
+
+    Raises
+    ------
+    ApcError
+        E203 another node. The fix adds zeros, or repeats the last value, or omits values that are too many.
     """
     if isinstance(node, Sequence) and len(node.items) == size:
         return node.items
@@ -185,7 +198,7 @@ def name_of(key: Scalar, subject: str, used: dict[str, str] | None = None, words
     return name
 
 
-def use(kind: str, location: SourceLocation) -> str:
+def first_use(kind: str, location: SourceLocation) -> str:
     """Return what a name is used for, for the message about its second use: `a clock, in line 4`."""
     return f"{kind}, in line {location.line}" if location.line else kind
 

@@ -26,7 +26,7 @@ from apc.compiler.files import FileReader, RefusedError
 from apc.compiler.language.csv_tables import NamedFiles
 from apc.compiler.language.values import AlreadyReportedError, ScalarValue
 from apc.compiler.source.nodes import Mapping, Scalar, Sequence
-from apc.compiler.source.reading import MappingReader, brief, fault, mapping_of, text_of, use
+from apc.compiler.source.reading import MappingReader, brief, fault, first_use, mapping_of, text_of
 from apc.compiler.source.source import Source
 from apc.compiler.topology.groups import GroupDeclaration, GroupReader, read_counts
 from apc.compiler.topology.instances import PartInstance, PartReader, settable_names
@@ -243,7 +243,7 @@ def _uses(root: MappingReader, section: str, names: Collection[str]) -> dict[str
     """Return the use of each of some names that a section defines, for messages about a second use."""
     node = root.nodes.get(section)
     entries = node.entries if isinstance(node, Mapping) else ()
-    return {key.text: use(KINDS[section], key.location) for key, _ in entries if key.text in names}
+    return {key.text: first_use(KINDS[section], key.location) for key, _ in entries if key.text in names}
 
 
 def _refuse_nested_section(root: Mapping) -> None:

@@ -145,6 +145,14 @@ def test_sides_of_equal_slopes_part_where_a_gain_varies(gain: str, tmp_path: Pat
     assert many.spectral_radius == pytest.approx([radius(10e3), radius(20e3), radius(50e3)], abs=1e-12)
 
 
+def test_a_side_with_a_neutral_motion_is_worse_than_a_stable_one(tmp_path: Path) -> None:
+    """A wall at zero depth: a mass that moves away from it does not return."""
+    found = apc.analyze(model(tmp_path, f"max(0, K*{X})", ", K: 1000 N/m"))
+    assert found.verdict == "stable up to a common translation"
+    assert {side.verdict for side in found.sides} == {"stable", "stable up to a common translation"}
+    assert found.spectral_radius == pytest.approx(radius(0), abs=1e-12) and radius(0) < radius(1000)
+
+
 def test_passive_hands_meet_the_whole_wall() -> None:
     """A wall of stiffness 0 and damping B at zero depth: b > B decides (Colgate and Schenkel), not B/2."""
     for damping, passive in ((1.9, True), (2.1, False)):
