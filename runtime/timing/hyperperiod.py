@@ -151,8 +151,7 @@ def _check_frame_length(
             periods = (1000 * frame * quantum / ticks for ticks in fits)
             short = (f"{float(ms):g} ms" for ms in periods if Fraction(f"{float(ms):.3g}") == ms)
             fix = f"{fastest}: {next(short, f'{frame * quantum / fits[0]} s')}"
-            least = f"{float(1000 * frame * quantum / fits[0]):.6g} ms"
-            advice = f"the shortest period of {fastest} in this frame is {least}"
+            advice = ""
         elif period.get(odd.name) and (ms := _rounded(period, odd.name)):
             fix, advice = f"{odd.name}: {ms} ms", ""
         location = SourceLocation(system.origin.topology, odd.line, odd.column)

@@ -94,7 +94,7 @@ def test_a_count_that_cannot_be_is_refused(text: str, setting: str, message: str
     [
         ("count: kt", " count: expected a plain number, got kt, which is in N/m."),
         ("count: m", "count: expected a whole number, or an expression in parameters, got m."),
-        ("count: n/2", "count: expected a whole number from 1 to 1000000000, got n/2, which is 1.5"),
+        ("count: n/2", "count: expected a whole number from 1 to 1,000,000,000, got n/2, which is 1.5"),
         ("count: peers", "count peers depends on peers, the sum of all counts."),
         ("count: twice", "count twice depends on peers, the sum of all counts."),
     ],
