@@ -132,7 +132,7 @@ def _partitioned(peer_type: FlatPeerType, mistakes: Mistakes) -> ClockedPeerType
                 mistakes.add("E505", given.location, message, fix=fix)
             elif clocks.is_undetermined(hold.variable):
                 message = f"hold({held}): {held} belongs to no clock"
-                advice = f"write sample() in the equations that determine {held}"
+                advice = f"an equation that determines {held} must sample a continuous variable"
                 mistakes.add("E505", hold.location, message, advice=advice)
             else:
                 message = f"hold({held}): {held} is already continuous"

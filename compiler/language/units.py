@@ -262,6 +262,8 @@ def quantity(
             if not _is_of(re.split(", | or ", examples)[0], requested.dimension):  # of another quantity
                 mistake = replace(mistake, message=message, expected=named)
                 error = ApcError(mistake)
+        elif single_name and mistake.code in ("E223", "E224") and not (mistake.expected or mistake.fix):
+            error = ApcError(mistake := replace(mistake, expected=named))
         if mistake.code in ("E223", "E224"):
             if cased := _in_usual_case(text, requested.dimension):
                 names = zip(NAME.findall(text), NAME.findall(cased), strict=True)
