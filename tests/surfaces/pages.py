@@ -34,7 +34,7 @@ def served(path: Path, *words: str) -> Iterator[str]:
         assert process.stdout is not None
         yield process.stdout.readline().strip()
         process.send_signal(signal.SIGINT)
-        _, err = process.communicate(timeout=60)
+        _, err = process.communicate(timeout=180)
         assert (process.returncode, err) == (0, "starting ...\nended\n"), (
             f"it ended with {process.returncode}: {err}"
         )

@@ -349,6 +349,7 @@ def test_topology_and_numbers_are_downloaded_with_the_values(tab: Tab, link: str
 
 @pytest.mark.whole
 def test_whoever_sees_no_pictures_and_has_no_mouse_finds_everything_by_name(tab: Tab, link: str) -> None:
+    tab.page.get_by_role("slider", name="time").wait_for()  # shown with the computed response
     names = [one.get_attribute("aria-label") for one in tab.page.get_by_role("slider").all()]
     assert None not in names and {"lan.delay", "user.count", "time"} <= set(names)
     headings = [one.inner_text() for one in tab.page.get_by_role("heading").all()]
