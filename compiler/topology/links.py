@@ -309,6 +309,8 @@ def _probability(node: Node, subject: str, numbers: NamedNumbers) -> ScalarValue
     expected, got = "a probability, 0 % to 100 %", brief(node.text) if isinstance(node, Scalar) else ""
     try:
         value = numbers.read(node, subject, DIMENSIONLESS, "%")
+    except AlreadyReportedError:
+        raise
     except ApcError as error:
         number = _NUMBER.match(got)
         fix = f"{subject}: {number[0]} %" if number and float(number[0]) <= 100 else ""

@@ -101,6 +101,8 @@ def _period(node: Node, subject: str, numbers: NamedNumbers) -> ScalarValue:
     """Return the period of a clock in seconds, from a time or a rate. Raises ApcError for other values."""
     try:
         return numbers.read_time(node, subject)
+    except AlreadyReportedError:
+        raise
     except ApcError as error:
         number = _NUMBER.match(node.text) if isinstance(node, Scalar) and is_quantity(node.text) else None
         fix = f"{subject}: {number[0]} ms" if number else ""

@@ -214,3 +214,14 @@ def test_the_line_to_write_for_a_reduction_that_is_sent_works(tmp_path: Path) ->
     named = {**NAMED, "continuous": more}
     own = OWN.format(force="hold(K*(y - relayed))", sent="sample(hold(relayed))", **named)
     assert 0.9 < apc.analyze(compiled(TOPOLOGY, library(tmp_path, own))).spectral_radius < 1.1
+
+
+@pytest.mark.parametrize("clock", ["peers", "{period: peers}"])
+@pytest.mark.parametrize(
+    "delay", ["peers", "8 ms, loss: peers", "8 ms, jitter: peers", "8 ms, loss: {p: peers, r: 1 %}"]
+)
+def test_a_name_with_an_error_is_reported_once_wherever_it_is_used(clock: str, delay: str) -> None:
+    text = ONE_MASS.replace("count: 1", "count: none")
+    text += f"clocks: {{tick: {clock}}}\nlinks: {{lan: {{clock: tick, delay: {delay}}}}}\n"
+    [message] = told(compiled, text)
+    assert message.startswith("topology.yaml:2:23: E2")
