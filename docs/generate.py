@@ -278,11 +278,11 @@ def constants(path: Path) -> Iterator[tuple[str, str, str]]:
         if block or end != node.lineno - 1:  # a comment of its own, or the first constant of a block
             above = " ".join(block)
         end = node.end_lineno or node.lineno
-        beside = " ".join(
+        comment = " ".join(
             line.partition("  # ")[2] for line in lines[node.lineno - 1 : end] if "  # " in line
         )
         shown = ast.unparse(node.value) if node.end_lineno != node.lineno else value
-        yield names, shown.strip("()"), (beside or above).replace("|", "\\|")
+        yield names, shown.strip("()"), (comment or above).replace("|", "\\|")
 
 
 def _is_numeric(node: ast.expr) -> bool:

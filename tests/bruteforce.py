@@ -69,10 +69,10 @@ class TopologySource:
 
 
 @dataclass(frozen=True)
-class Luck:
+class PacketOutcomes:
     """What becomes of packets in one frame: whether each that arrives is there, by (sender, receiver).
 
-    `missed` are the ways whose last packet before the frame is missing. With `zero` a peer that misses the
+    `missed` are the arcs whose last packet before the frame is missing. With `zero` a peer that misses the
     newest packet hears itself in its place, without it the newest that was there before.
     """
 
@@ -104,19 +104,21 @@ def frame_matrix(
     return [[columns[c][r] for c in range(n)] for r in range(n)]
 
 
-def ways_of(topology: TopologySource) -> list[tuple[int, int]]:
+def arcs_of(topology: TopologySource) -> list[tuple[int, int]]:
     """Return who hears whom, as (sender, receiver)."""
     return [(j, i) for i in range(topology.peers) for j, _ in topology.receives(i)]
 
 
-def lossy_frame(topology: TopologySource, noise: Luck) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def lossy_frame(
+    topology: TopologySource, noise: PacketOutcomes
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the one-frame matrix (n, n) in floats, and what pushes at each tick make of the state (n, k).
 
     Behind the state of `frame_matrix` stands by way the packet, (x, v), that is heard until another is there.
     At each haptic tick every device is pushed anew, by 1 N until the next.
     """
     size, frame, force_depth, packet_depth = _shape(topology)
-    n = size + 2 * len(ways_of(topology))
+    n = size + 2 * len(arcs_of(topology))
     rows = np.eye(n + topology.peers * int(frame / topology.haptic))
     found = _one_frame(
         topology, list(rows[:n]), frame, force_depth, packet_depth,
@@ -172,15 +174,13 @@ def _one_frame(
     packet_depth: int,
     number: Callable[[Any], Any],
     exp: Any,
-    noise: Luck | None = None,
+    noise: PacketOutcomes | None = None,
     pushes: Iterator[Any] | None = None,
 ) -> list[Any]:
     """Propagate all peers through one frame; with luck each way's last packet stands behind them."""
     size = 4 + 3 * force_depth + 2 * packet_depth
     behind = iter(state[topology.peers * size :])
-    last = (
-        {coupling_term: (next(behind), next(behind)) for coupling_term in ways_of(topology)} if noise else {}
-    )
+    last = {arc: (next(behind), next(behind)) for arc in arcs_of(topology)} if noise else {}
     parts = [list(state[i * size : (i + 1) * size]) for i in range(topology.peers)]
     value = [
         {
@@ -226,7 +226,7 @@ def _one_frame(
     def newest(listed: Sequence[tuple[Any, ...]], now: int, delay: int) -> tuple[Any, ...]:
         return max((one for one in listed if one[0] + delay <= now), key=lambda one: one[0])
 
-    there = {coupling_term: iter(listed) for coupling_term, listed in noise.there.items()} if noise else {}
+    there = {arc: iter(listed) for arc, listed in noise.there.items()} if noise else {}
     missed = set(noise.missed) if noise else set()
 
     def receive(j: int, i: int, now: int) -> tuple[Any, ...]:
@@ -238,14 +238,14 @@ def _one_frame(
         if (now - network_0) % network == 0:
             for i in range(topology.peers):
                 packets[i].append((now, motion[i][2], motion[i][3]))
-        for coupling_term in last:
-            delay = late.get(coupling_term, comm)
+        for arc in last:
+            delay = late.get(arc, comm)
             if (now - network_0 - delay) % network == 0:
-                missed -= {coupling_term}
-                if next(there[coupling_term]):
-                    last[coupling_term] = newest(packets[coupling_term[0]], now, delay)[1:]
+                missed -= {arc}
+                if next(there[arc]):
+                    last[arc] = newest(packets[arc[0]], now, delay)[1:]
                 else:
-                    missed |= {coupling_term}
+                    missed |= {arc}
         if (now - haptic_0) % haptic == 0:
             pushing = [next(pushes) for _ in motion] if pushes else pushing
             for i, (x, v, x_o, v_o) in enumerate(motion):

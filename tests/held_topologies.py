@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import Model
-from tests.bruteforce import Luck, TopologySource, lossy_frame, states_read, ways_of
+from tests.bruteforce import PacketOutcomes, TopologySource, arcs_of, lossy_frame, states_read
 from tests.topologies import compiled
 
 Floats = NDArray[np.float64]
@@ -69,14 +69,14 @@ class Frames:
 
 def _whole(topology: TopologySource, pairs: Sequence[tuple[int, int]], received: Sequence[float]) -> Floats:
     return lossy_frame(
-        topology, Luck({pair: (bool(one),) for pair, one in zip(pairs, received, strict=True)})
+        topology, PacketOutcomes({pair: (bool(one),) for pair, one in zip(pairs, received, strict=True)})
     )[0]
 
 
 def frames(peers: int, stiffness: float, damping: float = 0.0, operator: str = "mean") -> Frames:
     """Return the frames of the paper's users, whose packets are heard in the frame after they are sent."""
     topology = TopologySource(operator=operator, peers=peers, kt=stiffness, bt=damping, cube=0.6 / peers)
-    pairs = tuple(ways_of(topology))
+    pairs = tuple(arcs_of(topology))
     either = np.array([_whole(topology, pairs, [one] * len(pairs)) for one in (0.0, 1.0)])
     return Frames(topology, pairs, states_read(either))
 

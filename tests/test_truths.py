@@ -1,8 +1,7 @@
-"""Every topology whose truth is known, by every way that answers it: refused in words, or true within its
-bound.
+"""Every topology with a known result, by every method: refused with a message, or right within its bound.
 
-A way takes a case and gives what it says of it; a new method is one more line of `WAYS`. Every topology is
-analysed each time, and by some of the other ways; `pytest --whole` takes all of them.
+A method takes a case and returns its result; a new method is one more line of `METHODS`. Every topology is
+analyzed each time, and by some of the other methods; `pytest --whole` takes all of them.
 """
 
 from __future__ import annotations
@@ -24,8 +23,8 @@ from tests.truths import CASES, LIBRARY, UNTOLD, distance, model, text_of, truth
 
 
 @dataclass(frozen=True, slots=True)
-class Said:
-    """What a way says: the radius and what it may be off by, the motions left out, and the verdict."""
+class MethodResult:
+    """The result of a method: the spectral radius and its error bound, the free motions, and the verdict."""
 
     radius: float
     error: float
@@ -35,18 +34,18 @@ class Said:
     notes: tuple[str, ...] = ()
 
 
-def _point(name: str, **requested: object) -> Said:
+def _point(name: str, **requested: object) -> MethodResult:
     one = apc.analyze(model(name), **requested)  # type: ignore[arg-type] # a method or a proof
     if requested.get("certify"):
         # Floats that decided stay where balls do not; of determinants there is no proof.
         printed = ("proved", "decided with") if one.stable is not None else "undecided at"
         assert str(one.proof).startswith(printed) or one.method == "determinant"
-    return Said(
+    return MethodResult(
         one.spectral_radius, one.spectral_radius_error, one.rigid_modes, one.stable, one.verdict, one.notes
     )
 
 
-def _by(method: str) -> Callable[[str], Said]:
+def _by(method: str) -> Callable[[str], MethodResult]:
     return lambda name: _point(name, method=method)
 
 
@@ -58,14 +57,14 @@ def _number(name: str) -> tuple[str, float, str]:
     raise LookupError(name)
 
 
-def _many(name: str) -> Said:
+def _many(name: str) -> MethodResult:
     parameter, value, _ = _number(name)
     # Of points side by side some bounds are shared: the first of them is the topology's own.
     found = apc.analyze_many(model(name), {parameter: value * np.linspace(1, 1.01, 6)})
     if found.message[0]:
         raise RuntimeError(found.message[0])
     undecided = found.verdict[0].startswith("undecided")
-    return Said(
+    return MethodResult(
         found.spectral_radius[0],
         found.spectral_radius_error[0],
         int(found.rigid_modes[0]),
@@ -74,14 +73,14 @@ def _many(name: str) -> Said:
     )
 
 
-def _sweep(name: str) -> Said:
+def _sweep(name: str) -> MethodResult:
     parameter, value, unit = _number(name)
     found = apc.sweep(model(name), {parameter: [f"{value!r} {unit}"]}, jobs=1)
     told = {heading: found.column(heading)[0] for heading in found.headings}
     if told["message"]:
         raise RuntimeError(told["message"])
     verdict = str(told["verdict"])
-    return Said(
+    return MethodResult(
         float(told["spectral_radius"]),
         float(told["spectral_radius_error"]),
         int(told["rigid_modes"]),
@@ -90,21 +89,21 @@ def _sweep(name: str) -> Said:
     )
 
 
-def _export(name: str) -> Said:
+def _export(name: str) -> MethodResult:
     found = apc.export(model(name), to="npz").a
     rigid = truth(name).rigid
     values = np.linalg.eigvals(found)
     stored = values[np.argsort(np.abs(values - 1))][rigid:]
-    return Said(float(np.abs(stored).max(initial=0.0)), 1e-7, rigid)
+    return MethodResult(float(np.abs(stored).max(initial=0.0)), 1e-7, rigid)
 
 
-def _box(name: str) -> Said:
+def _box(name: str) -> MethodResult:
     parameter, _, _ = _number(name)
     found = apc.robust_stability(model(name), {parameter: "±1e-9%"})
-    return Said(float(truth(name).radius), 1e-15 * float(truth(name).radius), None, found.stable)
+    return MethodResult(float(truth(name).radius), 1e-15 * float(truth(name).radius), None, found.stable)
 
 
-WAYS: dict[str, Callable[[str], Said]] = {
+METHODS: dict[str, Callable[[str], MethodResult]] = {
     "point": _point,
     "dense": _by("dense"),
     "determinant": _by("determinant"),
@@ -116,7 +115,7 @@ WAYS: dict[str, Callable[[str], Said]] = {
     "box": _box,
 }
 
-# What a way may say it can't serve, by the words it says it in.
+# The messages with which a method may refuse a case.
 REFUSED = {
     "dense": ("states; the limit is 1,000",),
     "determinant": ("rounding within a frame exceeds the eigenvalues of single peers",),
@@ -152,9 +151,7 @@ LEFT_OUT = {
     ("box", "non-commensurate"),
 }
 
-LONG = {
-    (coupling_term, "non-commensurate") for coupling_term in ("point", "dense", "many", "sweep", "certify")
-} | {
+LONG = {(method, "non-commensurate") for method in ("point", "dense", "many", "sweep", "certify")} | {
     ("point", "ring-of-eight"),
     ("box", "stiff-contact"),
     ("box", "a cycle one way"),
@@ -162,42 +159,40 @@ LONG = {
 
 
 def _pairs() -> list[object]:
-    """Return every case with every way; each case with `point` and a few others is no matter of --whole."""
+    """Return every case with every method; `point` and a few others do not require --whole."""
     found = []
     for place, (name, case) in enumerate(CASES.items()):
-        for column, coupling_term in enumerate(WAYS):
-            if (coupling_term, case.name) in LEFT_OUT or (
-                case.source == "closed" and coupling_term == "paper"
-            ):
+        for column, method in enumerate(METHODS):
+            if (method, case.name) in LEFT_OUT or (case.source == "closed" and method == "paper"):
                 continue
-            ordinary = (coupling_term == "point" or (place + column) % 6 == 0) and (
-                coupling_term,
+            ordinary = (method == "point" or (place + column) % 6 == 0) and (
+                method,
                 case.name,
             ) not in LONG
             marks = () if ordinary else pytest.mark.whole
-            found.append(pytest.param(name, coupling_term, marks=marks, id=f"{name}-{coupling_term}"))
+            found.append(pytest.param(name, method, marks=marks, id=f"{name}-{method}"))
     return found
 
 
 @pytest.mark.needs_extension("paper_method", "parameter_boxes")
 @pytest.mark.few(70)
-@pytest.mark.parametrize(("name", "coupling_term"), _pairs())
-def test_every_way_is_true_within_its_bound_or_refuses_in_words(name: str, coupling_term: str) -> None:
+@pytest.mark.parametrize(("name", "method"), _pairs())
+def test_every_method_is_right_within_its_bound_or_refuses(name: str, method: str) -> None:
     case, told = CASES[name], truth(name)
     try:
-        printed = WAYS[coupling_term](name)
+        printed = METHODS[method](name)
     except ApcError as error:
-        assert any(words in str(error) for words in REFUSED.get(coupling_term, ())), str(error)
+        assert any(words in str(error) for words in REFUSED.get(method, ())), str(error)
         return
-    wide = WIDE.get(coupling_term, {}).get(case.name, USEFUL)
-    error = wide * max(1.0, printed.radius) if coupling_term == "export" else printed.error
+    wide = WIDE.get(method, {}).get(case.name, USEFUL)
+    error = wide * max(1.0, printed.radius) if method == "export" else printed.error
     assert distance(printed.radius, told) <= error
     assert error <= wide * max(1.0, printed.radius)
     assert printed.rigid is None or printed.rigid == told.rigid
-    if coupling_term == "export" or (coupling_term == "box" and abs(told.radius - 1) < 1e-8):
+    if method == "export" or (method == "box" and abs(told.radius - 1) < 1e-8):
         return
     if printed.stable is None:
-        assert case.name in OPEN.get(coupling_term, ()) or abs(told.radius - 1) < 1e-30
+        assert case.name in OPEN.get(method, ()) or abs(told.radius - 1) < 1e-30
     else:
         assert printed.stable == (told.radius < 1 and told.verdict != "drifts")
         assert not (printed.verdict and told.verdict) or printed.verdict == told.verdict
@@ -309,11 +304,11 @@ SEARCHES = {
 
 @pytest.mark.needs_extension("parameter_boxes")
 @pytest.mark.few(16)
-@pytest.mark.parametrize("coupling_term", SEARCHES)
+@pytest.mark.parametrize("method", SEARCHES)
 @pytest.mark.parametrize("name", LIMIT)
-def test_a_limit_is_that_of_the_reference(name: str, coupling_term: str) -> None:
+def test_a_limit_is_that_of_the_reference(name: str, method: str) -> None:
     one = LIMIT[name]
-    assert SEARCHES[coupling_term](one) == pytest.approx(one.value, abs=one.error)
+    assert SEARCHES[method](one) == pytest.approx(one.value, abs=one.error)
 
 
 def test_without_damping_the_mesh_holds_exactly_half_of_what_the_average_does() -> None:

@@ -73,7 +73,7 @@ class Transparency(Result):
     `impedance` in N·s/m is force by velocity, with the other devices free; `transmitted_admittance` in m/s/N
     is the other device's velocity by the force, `coordination_error` in m/N the distance of the driven peer's
     object copy from the mean of the others. All are complex, at the fundamental. `aliased_fraction` is the
-    largest ratio of an alias at the device, a frame rate apart, to the fundamental. `network_damping` is the
+    largest ratio of an alias (a frame rate away) at the device to the fundamental. `network_damping` is the
     part of the damping caused by the network. `bound` is the relative error bound of the impedance;
     `transmitted_bound` and `error_bound` are those of the others.
     """

@@ -82,7 +82,7 @@ def enclosing_radius(function: Characteristic, point: complex) -> tuple[float, i
 
 
 def _least_radius(function: Characteristic, point: complex, offset: float) -> float:
-    """Return the radius of the smallest circle about a zero to count, from the relative error of f beside
+    """Return the radius of the smallest circle about a zero to count, from the relative error of f next to
     the zero.
     """
     ball = characteristic_ball(function, np.array([point + offset]), np.zeros(1))

@@ -153,11 +153,9 @@ class _Network:
             if link.channel is None:
                 continue
             law = channel_law(plan.system, link, timings[link.delay])
-            for coupling_term in itertools.permutations(range(plan.exchange.peers), 2):
-                used = PacketSource(law, name, [coupling_term], seed=plan.system.experiment.seed).take(
-                    MOST_PACKETS
-                )
-                self.late[(name, *coupling_term)] = used[0].tolist()
+            for arc in itertools.permutations(range(plan.exchange.peers), 2):
+                used = PacketSource(law, name, [arc], seed=plan.system.experiment.seed).take(MOST_PACKETS)
+                self.late[(name, *arc)] = used[0].tolist()
 
     def send(self, peer: ExportedPeer, at: int, printed: Mapping[str, float]) -> None:
         for line in peer.lines:
@@ -176,10 +174,10 @@ class _Network:
             for sender in line.senders:
                 late = exchange.delay(line.link, int(groups[sender.peer]), int(groups[peer.number]))
                 number, gone = (at - int(timings[late] / self.quantum) - phase) // period, False
-                if (coupling_term := (line.link, sender.peer, peer.number)) in self.late:
+                if (arc := (line.link, sender.peer, peer.number)) in self.late:
                     newest = self.links[line.link].channel.reorder != "all"
                     tick = int(at * self.quantum * 1000)  # ticks every millisecond, packets every eight
-                    number, gone = effective(self.late[coupling_term], tick, newest=newest)
+                    number, gone = effective(self.late[arc], tick, newest=newest)
                 if number < 0:
                     found += sender.start
                 else:

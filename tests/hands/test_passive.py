@@ -192,12 +192,12 @@ def by_region(system: Model, limit: float) -> None:
 
 
 @pytest.mark.few(2)
-@pytest.mark.parametrize("coupling_term", [by_critical, by_certificate, by_sweep, by_region])
+@pytest.mark.parametrize("method", [by_critical, by_certificate, by_sweep, by_region])
 def test_every_way_to_ask_finds_what_an_independent_program_found(
-    coupling_term: Callable[[Model, float], None],
+    method: Callable[[Model, float], None],
 ) -> None:
     """Three users bear 458.24216 N/m with any passive hand."""
-    coupling_term(users(3, 200), 458.24216)
+    method(users(3, 200), 458.24216)
 
 
 @pytest.mark.parametrize(("count", "limit"), [(2, 233.1357), (5, 895.643)])

@@ -383,10 +383,10 @@ def test_a_critical_delay_is_that_of_the_worse_side() -> None:
         motion = np.eye(2)
         for length, force in ((late, 5), (PERIOD - late, 4)):  # of tick k − 3, then of tick k − 2
             e = math.exp(-damping / mass * length)
-            coupling_term = (1 - e) * mass / damping
-            part = np.array([[1.0, coupling_term], [0.0, e]])
+            coefficient = (1 - e) * mass / damping
+            part = np.array([[1.0, coefficient], [0.0, e]])
             step[:2] = part @ step[:2]
-            step[:2, force] -= np.array([(length - coupling_term) / damping, (1 - e) / damping])
+            step[:2, force] -= np.array([(length - coefficient) / damping, (1 - e) / damping])
             motion = part @ motion
         step[:2, :2] = motion
         return float(abs(np.linalg.eigvals(step)).max())

@@ -1,4 +1,4 @@
-"""Eigenvalues of matrices known up to an error lie within the bounds that any way tells of them."""
+"""Eigenvalues of matrices known up to an error lie within the bounds that every method computes."""
 
 from __future__ import annotations
 
@@ -18,24 +18,24 @@ from apc.spectrum.enclosure import enclose_eigenvalues, enclose_stack, least_rad
 
 Floats = NDArray[Any]
 
-# What a way says of a matrix: eigenvalues, a bound of each, the radius from below and above; or nothing.
-Told = tuple[Floats, Floats, float, float] | None
+# The result of a method: the eigenvalues, a bound of each, the least and largest radius; or nothing.
+Enclosure = tuple[Floats, Floats, float, float] | None
 
 
-def _enclosed(matrix: Floats, error: Floats) -> Told:
+def _enclosed(matrix: Floats, error: Floats) -> Enclosure:
     pairs, found = enclose_eigenvalues(matrix, error)
     assert np.isfinite([*found.errors, found.high]).all()
     return pairs.values, found.errors, found.low, found.high
 
 
-def _stacked(matrix: Floats, error: Floats) -> Told:
+def _stacked(matrix: Floats, error: Floats) -> Enclosure:
     n = len(matrix)
     alongside = np.stack([matrix, np.diag(np.arange(n, dtype=np.float64))])
     pairs, found = enclose_stack(alongside, np.stack([error, np.zeros((n, n))]))
     return pairs.values[0], found.errors[0], float(found.low[0]), float(found.high[0])
 
 
-WAYS = {"by parts": _enclosed, "stacked": _stacked}
+METHODS = {"by parts": _enclosed, "stacked": _stacked}
 
 
 def _drawn(generator: np.random.Generator) -> dict[str, Floats]:
@@ -108,13 +108,11 @@ def _matrices(seed: int) -> list[tuple[str, Floats, Floats, list[Floats]]]:
 @pytest.mark.parametrize(
     "seed", [*range(3), *(pytest.param(k, marks=pytest.mark.whole) for k in range(3, 15))]
 )
-@pytest.mark.parametrize("coupling_term", WAYS)
-def test_every_matrix_within_the_error_has_its_eigenvalues_within_the_bounds(
-    coupling_term: str, seed: int
-) -> None:
+@pytest.mark.parametrize("method", METHODS)
+def test_every_matrix_within_the_error_has_its_eigenvalues_within_the_bounds(method: str, seed: int) -> None:
     told = 0
     for name, matrix, error, truths in _matrices(seed):
-        printed = WAYS[coupling_term](matrix, error)
+        printed = METHODS[method](matrix, error)
         if printed is None:
             continue
         told += 1
@@ -159,8 +157,8 @@ def test_the_exact_eigenvalues_of_small_rational_matrices_are_within_every_bound
     roots = np.array([complex(root) / 64 for root, times in polynomial.complex_roots() for _ in range(times)])
     matrix = np.array(rows) / 64
     radius = np.abs(roots).max()
-    for name, coupling_term in WAYS.items():
-        printed = coupling_term(matrix, np.zeros_like(matrix))
+    for name, method in METHODS.items():
+        printed = method(matrix, np.zeros_like(matrix))
         if printed is None:
             continue
         values, errors, low, high = printed

@@ -4,7 +4,7 @@ Takes: a topology of `bruteforce`, and how its packets get lost.
 Gives: `Law`, `second_moment_radius`, `rms_error`.
 Guarantees: frames are stepped event by event for each pattern of packets; no symmetry is used, no jitter.
 
-Luck is a Markov chain of each way from peer to peer: whether it is bad, whether its last packet is missed.
+`PacketOutcomes` is a Markov chain of each arc: whether it is bad, whether its last packet is missed.
 Of X, the second moments at each combination of these, a frame makes Σ P M X Mᵀ, over all that can happen.
 """
 
@@ -20,7 +20,7 @@ import scipy.linalg
 import scipy.sparse.linalg
 from numpy.typing import NDArray
 
-from tests.bruteforce import Luck, TopologySource, common_period, lossy_frame, ways_of
+from tests.bruteforce import PacketOutcomes, TopologySource, arcs_of, common_period, lossy_frame
 
 Floats = NDArray[np.float64]
 State = tuple[bool, bool]  # of a way: whether it is bad, and whether its last packet is missed
@@ -81,11 +81,11 @@ class Lossy:
     """
 
     def __init__(self, topology: TopologySource, law: Law) -> None:
-        coupling_terms = ways_of(topology)
+        arcs = arcs_of(topology)
         states: dict[tuple[State, ...], int] = {}
         happens: dict[tuple[int, tuple[bool, ...], tuple[tuple[bool, ...], ...]], int] = {}
         moves = []
-        for joint in itertools.product([*law.moves(arrivals_of(topology))], repeat=len(coupling_terms)):
+        for joint in itertools.product([*law.moves(arrivals_of(topology))], repeat=len(arcs)):
             before, after, chances, there = zip(*joint, strict=True)
             first, last = (states.setdefault(one, len(states)) for one in (before, after))
             key = (first, tuple(missed for _, missed in before), there)
@@ -97,14 +97,12 @@ class Lossy:
         made = {}
         for _, missed, there in happens:
             if (missed, there) not in made:
-                gone = [
-                    coupling_term for coupling_term, one in zip(coupling_terms, missed, strict=True) if one
-                ]
-                noise = Luck(dict(zip(coupling_terms, there, strict=True)), gone, law.zero)
+                gone = [arc for arc, one in zip(arcs, missed, strict=True) if one]
+                noise = PacketOutcomes(dict(zip(arcs, there, strict=True)), gone, law.zero)
                 made[missed, there] = lossy_frame(topology, noise)
         moved = np.array([made[missed, there][0] for _, missed, there in happens])
         place = np.arange(moved.shape[1])
-        size = (len(place) - 2 * len(coupling_terms)) // topology.peers
+        size = (len(place) - 2 * len(arcs)) // topology.peers
         bodies = (place % size < 4) & (place < topology.peers * size)
         reads = np.tile(bodies, (len(states), 1))
         for _ in place:

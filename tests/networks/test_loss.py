@@ -140,7 +140,7 @@ HOLD_10, ZERO_20 = ("loss: 10 %", 1143.224858916119), ("loss: 20 %, on_loss: zer
 @pytest.mark.needs_extension("loss_models")
 @pytest.mark.few(2)
 @pytest.mark.parametrize(
-    ("coupling_term", "more", "stiffness"),
+    ("method", "more", "stiffness"),
     [
         (by_critical, *HOLD_10),
         (by_critical, *ZERO_20),
@@ -150,9 +150,9 @@ HOLD_10, ZERO_20 = ("loss: 10 %", 1143.224858916119), ("loss: 20 %, on_loss: zer
     ],
 )
 def test_every_way_to_ask_finds_the_stiffness_at_which_a_reference_is_critical(
-    coupling_term: Callable[[Model, float], tuple[float, float]], more: str, stiffness: float
+    method: Callable[[Model, float], tuple[float, float]], more: str, stiffness: float
 ) -> None:
-    value, error = coupling_term(compiled(unreliable(more)), stiffness)
+    value, error = method(compiled(unreliable(more)), stiffness)
     # The references' radii are known to 3e-10 and change by some 1.6e-4 a N/m.
     assert abs(value - stiffness) <= 2e-6 + error
     assert error < 0.011

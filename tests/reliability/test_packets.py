@@ -218,13 +218,13 @@ def test_a_ticks_packets_are_those_that_had_come(monkeypatch: pytest.MonkeyPatch
     player = loop.player
     loop.begins = 1
     period, values = 8_000_000, (0.25,) * len(player.links[0].channels_of(1))
-    coupling_term = player.routes[0].pairs.tolist().index([1, 0])
+    arc = player.routes[0].pairs.tolist().index([1, 0])
 
     def newest(at: int) -> int:
         """Return the packet that a tick sees at the end of a period."""
         player.instant = at * period
         player._packets_at_tick(0, 0, ())
-        return int(player.newest[0][coupling_term])
+        return int(player.newest[0][arc])
 
     for count, came in ((3, 3 * period + 1), (2, 3 * period + 2)):
         player.receive(Data(1, 0, 0, count, values), came)

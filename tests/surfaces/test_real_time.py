@@ -62,11 +62,9 @@ def test_all_peers_of_a_topology_do_what_is_simulated_with_the_packets_they_hear
     assert max(far for far, _ in told["differences"].values()) <= 1e-9
     assert told["differences"]["N"][1] > 0.1
     assert len(told["arcs"]) == 2
-    for coupling_term in told["arcs"]:
-        assert (
-            0.01 < coupling_term["came"]["lost"]["share"] < 0.45
-        )  # of 125, of which 20 % are lost: 6 deviations
-        assert coupling_term["came"]["shortest"] >= 0.008
+    for arc in told["arcs"]:
+        assert 0.01 < arc["came"]["lost"]["share"] < 0.45  # of 125, of which 20 % are lost: 6 deviations
+        assert arc["came"]["shortest"] >= 0.008
     assert [one.name for one in read_run(Path("three.run")).peers] == ["user[1]", "user[2]"]
     assert run(["compare", "three.run"]) == 0
     out = capsys.readouterr().out

@@ -140,19 +140,19 @@ links:
     return compile_topology(folder / "topology.yaml")
 
 
-Ways = Mapping[tuple[int, int], float]  # the weight of each (sender, receiver)
-COMPLETE: Ways = {(i, j): 1.0 for i in range(4) for j in range(4) if i != j}
+ArcWeights = Mapping[tuple[int, int], float]  # the weight of each (sender, receiver)
+COMPLETE: ArcWeights = {(i, j): 1.0 for i in range(4) for j in range(4) if i != j}
 
 
-def by_hand(force: Force, coupling_terms: Ways, late: Late, *, zero: bool = False) -> NDArray[np.float64]:
+def by_hand(force: Force, arcs: ArcWeights, late: Late, *, zero: bool = False) -> NDArray[np.float64]:
     """Return every body's x and v at each ms; `late` says which packet counts on a way at a tick."""
 
     def law(i: int, motion: Any, received: Any, memory: Any) -> tuple[Any, Any, Any]:
-        weighted = [(coupling_terms[j, i], *packet[:2]) for j, packet in received.items()]
+        weighted = [(arcs[j, i], *packet[:2]) for j, packet in received.items()]
         f = force(*motion[0], memory[0], memory[1] / 1000, weighted)
         return [-f], [f, memory[1] + 1], []
 
-    receives = [[j for j in range(4) if (j, i) in coupling_terms] for i in range(4)]
+    receives = [[j for j in range(4) if (j, i) in arcs] for i in range(4)]
     scheme = ByHand([[(0.1, 5.0, 0.0)]] * 4, receives, law, told=0, memory=2, late=late, zero=zero)
     rows = itertools.islice(course(scheme, [[(x, 0.0)] for x in X], [[0.0, 0]] * 4), int(DURATION / MS) + 1)
     return np.array([[one for motion in now.motion for body in motion for one in body] for now in rows])
@@ -169,8 +169,16 @@ def check(system: Model, expected: NDArray[np.float64], *, seed: int = 0, jit: b
     np.testing.assert_allclose(found.values, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
 
 
-ARCS: Ways = {(0, 1): 0.5, (2, 1): 2.0, (3, 1): 1.0, (1, 0): 1.0, (3, 2): 3.0, (0, 3): 0.25, (1, 3): 1.5}
-GRAPHS: dict[str, Ways] = {
+ARCS: ArcWeights = {
+    (0, 1): 0.5,
+    (2, 1): 2.0,
+    (3, 1): 1.0,
+    (1, 0): 1.0,
+    (3, 2): 3.0,
+    (0, 3): 0.25,
+    (1, 3): 1.5,
+}
+GRAPHS: dict[str, ArcWeights] = {
     "": COMPLETE,
     "ring": {(i, j): 1.0 for i in range(4) for j in ((i + 1) % 4, (i - 1) % 4)},
     "star": {(i, j): 1.0 for i in range(4) for j in range(4) if (i == 0) != (j == 0)},
@@ -216,16 +224,13 @@ def test_a_lost_packet_is_missed_by_its_pair_alone(tmp_path: Path, name: str, mo
     _, force = FORCES[name]
     system = topology(tmp_path, name, f"delay: 8 ms, {more}" + (f", graph: {graph}" if graph else ""))
     law = channel_law(system, system.links[0], 8 * MS)
-    coupling_terms = GRAPHS[graph]
-    late = {
-        coupling_term: PacketSource(law, "lan", [coupling_term], seed=3).take(50)[0].tolist()
-        for coupling_term in coupling_terms
-    }
+    arcs = GRAPHS[graph]
+    late = {arc: PacketSource(law, "lan", [arc], seed=3).take(50)[0].tolist() for arc in arcs}
 
     def packet(i: int, j: int, tick: int) -> tuple[int, bool]:
         return effective(late[i, j], tick, newest="all" not in more)
 
-    expected = by_hand(force, coupling_terms, packet, zero="zero" in more)
+    expected = by_hand(force, arcs, packet, zero="zero" in more)
     for jit in (False, True):
         check(system, expected, seed=3, jit=jit)
 
