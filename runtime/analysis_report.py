@@ -370,7 +370,7 @@ def sensitivities_of(numeric: NumericModel, analysis: Analysis) -> Sensitivities
     if why := _too_large(numeric, analysis) or _too_many_products(numeric.model):
         return _not_reported(analysis.spectral_radius, why)
     try:
-        result = sensitivities(numeric)
+        result = sensitivities(numeric, analysis=analysis)
     except ApcError as error:
         return _not_reported(analysis.spectral_radius, f"not computed: {error.mistakes[0].message}")
     # The matrices of the derivatives are rounded, the analysis is exact: both must have the same spectral

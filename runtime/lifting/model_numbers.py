@@ -1,7 +1,7 @@
 """The numbers of a model at its parameter values, resolved for each peer.
 
 Takes: a `Model` and the Jacobians of its peer types.
-Gives: `ModelNumbers`, `PeerIndices`.
+Gives: `ModelNumbers`, `PeerIndices`; `cached_in_model`.
 Guarantees: data that does not depend on parameter values is built once.
 Does not: change parameter values (see `numeric_model`).
 """
@@ -9,10 +9,11 @@ Does not: change parameter values (see `numeric_model`).
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Callable, Hashable, Iterator
 from dataclasses import dataclass, field
 from fractions import Fraction
-from functools import cached_property
+from functools import cached_property, wraps
+from typing import Any, Concatenate, ParamSpec, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +26,9 @@ from apc.timing.schedule import ORDER, Schedule
 from apc.timing.scheduling import build_schedules
 
 Floats = NDArray[np.float64]
+Arguments = ParamSpec("Arguments")
+AnyModel = TypeVar("AnyModel", bound="ModelNumbers")
+Returned = TypeVar("Returned")
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,6 +91,11 @@ class ModelNumbers:
         return build_schedules(self.model, self.timings, patterns, order=self.order)
 
     @cached_property
+    def results(self) -> dict[Hashable, Any]:
+        """The results of functions decorated by `cached_in_model`."""
+        return {}
+
+    @cached_property
     def numbers(self) -> ResolvedNumbers:
         """The resolved parameters of all peers."""
         return resolve(self.model)
@@ -111,3 +120,23 @@ class ModelNumbers:
         group = self.exchange.group_of(peer)
         row = self.numbers.rows[group][peer - self.exchange.starts[group]]
         return np.asarray(self.numbers.parameters[group][row])
+
+
+def cached_in_model(
+    function: Callable[Concatenate[AnyModel, Arguments], Returned],
+) -> Callable[Concatenate[AnyModel, Arguments], Returned]:
+    """Return a function of a model that stores its results in the model, as long as the model exists.
+
+    A model with other parameter values is another object, with its own results.
+    """
+
+    @wraps(function)
+    def cached(numeric: AnyModel, /, *arguments: Arguments.args, **options: Arguments.kwargs) -> Returned:
+        """Return the stored result, computed at the first call."""
+        key = function, arguments, tuple(options.items())
+        if key not in numeric.results:
+            numeric.results[key] = function(numeric, *arguments, **options)
+        result: Returned = numeric.results[key]
+        return result
+
+    return cached

@@ -19,6 +19,7 @@ import numpy as np
 from apc.analysis.nonlinear_elements import is_linear
 from apc.analysis.one_sided_slopes import severity, sides
 from apc.compiler.compiled import Link, Model
+from apc.lifting.model_numbers import cached_in_model
 from apc.lifting.numeric_model import NumericModel
 from apc.linearization.evaluation_errors import finite_equations
 from apc.mean_square.class_moments import (
@@ -125,6 +126,7 @@ class StabilityMeasure:
 
 
 @np.errstate(all="ignore")
+@cached_in_model
 def mean_square_growth(numeric: NumericModel, *, bounded: bool = True) -> StabilityMeasure:
     """Return the growth factor of second moments per frame, common translations excluded.
 

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.lifting.initial_reception import Gains, StartClasses
 from apc.lifting.lift import FrameMap, check_packets, lift
-from apc.lifting.model_numbers import PeerIndices
+from apc.lifting.model_numbers import PeerIndices, cached_in_model
 from apc.lifting.numeric_model import NumericModel
 from apc.linearization.evaluation_errors import at_part
 from apc.linearization.jacobians import SubsystemJacobians
@@ -242,6 +242,7 @@ def too_large(exchange: CommunicationGraph, subject: str, states: int, *, auto: 
 MOST_DIFFERENT = 400
 
 
+@cached_in_model
 def peer_groups(numeric: NumericModel) -> tuple[PeerClass, ...]:
     """Return the classes of equal peers of a model, each linearized once.
 

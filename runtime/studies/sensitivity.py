@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import analyze, lifted_groups, prepare_at_start
+from apc.analysis.analysis import Analysis, analyze, prepare_at_start
 from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError, SourceLocation
 from apc.compiler.timings import part
@@ -35,8 +35,6 @@ from apc.parameter_values.display_units import DisplayUnit
 from apc.parameter_values.parameter_names import ParameterRef, named_times, parameter_of, unit_of, value_now
 from apc.result import Result
 from apc.spectrum.eigenpairs import driving_parts, eigenpairs
-from apc.spectrum.modes import split
-from apc.spectrum.spectrum import solve_spectrum
 from apc.studies.evaluator import evaluator, free_parameters
 from apc.studies.evaluator_choice import radius_evaluator
 from apc.studies.stability_criteria import MEAN_SQUARE, NOMINAL
@@ -107,18 +105,20 @@ class Sensitivities(Result):
 
 
 @part("sensitivities")
-def sensitivities(numeric: NumericModel) -> Sensitivities:
+def sensitivities(numeric: NumericModel, *, analysis: Analysis | None = None) -> Sensitivities:
     """Return the derivative of the spectral radius with respect to every settable parameter.
 
     Parameters
     ----------
     numeric
         The model with the parameter values at which to differentiate.
+    analysis
+        The analysis at these values, if already computed.
 
     Raises
     ------
     ApcError
-        As for `analysis.lifted_groups`.
+        As for `analysis.analyze`.
 
     Notes
     -----
@@ -128,10 +128,10 @@ def sensitivities(numeric: NumericModel) -> Sensitivities:
     with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
         parameter_refs = varied(system)
         start = prepare_at_start(numeric, parameter_refs)
+        now = analysis or analyze(numeric)
         if start is None:
-            return _by_analyses(numeric, parameter_refs)
-        systems = split(*lifted_groups(start))
-        largest = solve_spectrum(systems, in_balls=False).spectral_radius + SHARED
+            return _by_analyses(numeric, parameter_refs, now)
+        largest = now.spectral_radius + SHARED
 
         @cache
         def clusters_of(*parameters: ParameterRef) -> list[_Cluster] | None:
@@ -169,7 +169,7 @@ def sensitivities(numeric: NumericModel) -> Sensitivities:
                 excluded.append(parameters[0].label)
                 continue
             if parameter_clusters is None:  # nonsmooth equations: no derivative
-                return _by_analyses(numeric, parameter_refs)
+                return _by_analyses(numeric, parameter_refs, now)
             clusters, first_rank = clusters or parameter_clusters, 0
             for cluster in parameter_clusters:
                 if not cluster.condition < WORST:
@@ -215,9 +215,10 @@ def varied(system: Model) -> list[ParameterRef]:
     return [parameter_ref for parameter_ref in free_parameters(system) if parameter_ref.name not in excluded]
 
 
-def _by_analyses(numeric: NumericModel, parameter_refs: Sequence[ParameterRef]) -> Sensitivities:
+def _by_analyses(
+    numeric: NumericModel, parameter_refs: Sequence[ParameterRef], now: Analysis
+) -> Sensitivities:
     """Return the sensitivities of a model's spectral radius, by differences of analyses."""
-    now = analyze(numeric)
     if not now.modes:
         return Sensitivities(0.0, (), (), "the topology has no motion, so there is no eigenvalue")
     least_magnitude = now.spectral_radius - SHARED
@@ -279,23 +280,17 @@ def _finite_differences(
         The radius at the present values, and its eigenvalues with the names of their systems.
     """
     system = numeric.model
+    channels = channel_numbers(system)
+    together = [parameter_ref for parameter_ref in parameter_refs if parameter_ref.name not in channels]
+    rates = dict(zip(together, _rates_of_change(numeric, together, criterion), strict=True))
     rows, not_differentiated = [], []
     for parameter_ref in parameter_refs:
         present = value_now(system, parameter_ref)
-        scale = present or 1.0  # for 0, the unit of the parameter
-        try:
-            evaluator = radius_evaluator(numeric, (parameter_ref,), LOCATION, criterion)
-            ((radius_value, slope),) = evaluator.slopes(np.array([[present]]), np.array([[scale]]))
-        except ApcError:  # no verdict at a neighbouring value
-            radius_value = slope = np.full((1, 1, 1), np.nan)
-        # The derivative of the square, as the radius is the root of the growth.
-        rate = slope.item() * (2 * radius_value.item() if criterion == MEAN_SQUARE else 1.0) / scale
-        if math.isfinite(rate):
-            rows.append(
-                Sensitivity(
-                    parameter_ref.label, unit_of(system, parameter_ref.name), present, rate, rate * present, 0
-                )
-            )
+        if parameter_ref not in rates:
+            (rates[parameter_ref],) = _rates_of_change(numeric, [parameter_ref], criterion)
+        if math.isfinite(rate := rates[parameter_ref]):
+            unit = unit_of(system, parameter_ref.name)
+            rows.append(Sensitivity(parameter_ref.label, unit, present, rate, rate * present, 0))
         else:
             not_differentiated.append(parameter_ref.label)
     rows.sort(key=lambda row: (-abs(row.relative), row.parameter))
@@ -303,6 +298,31 @@ def _finite_differences(
         f"; not differentiated: {', '.join(not_differentiated)}" if not_differentiated else ""
     )
     return Sensitivities(radius, active, tuple(rows), note)
+
+
+def _rates_of_change(
+    numeric: NumericModel, parameter_refs: Sequence[ParameterRef], criterion: str
+) -> list[float]:
+    """Return the derivatives of a criterion's value, in SI; NaN where a neighbouring value has no verdict."""
+    if not parameter_refs:
+        return []
+    present = np.array([value_now(numeric.model, parameter_ref) for parameter_ref in parameter_refs])
+    scales = np.where(present, present, 1.0)  # for 0, the unit of the parameter
+    try:
+        evaluator = radius_evaluator(numeric, tuple(parameter_refs), LOCATION, criterion)
+        ((values, slopes),) = evaluator.slopes(np.tile(present, (len(present), 1)), np.diag(scales))
+    except ApcError:
+        if len(parameter_refs) == 1:
+            return [math.nan]
+        return [
+            rate
+            for parameter_ref in parameter_refs
+            for rate in _rates_of_change(numeric, [parameter_ref], criterion)
+        ]
+    # The derivative of the square, as the radius is the root of the growth.
+    factors = 2 * values.ravel() if criterion == MEAN_SQUARE else np.ones(len(present))
+    rates: list[float] = (slopes.ravel() * factors / scales).tolist()
+    return rates
 
 
 def not_varied(count: int, growth: StabilityMeasure) -> str:
