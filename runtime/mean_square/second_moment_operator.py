@@ -1,7 +1,7 @@
 """The second-moment map of a frame under random channel noise, with proved bounds of its spectral radius.
 
 Takes: state matrices, noise input matrices, and the linear forms that generate the noise.
-Gives: `MomentBlock`, `Operator`; `GrowthBounds`, `enclose_growth`, `growth_with_slope`, `proves_decay`,
+Gives: `MomentBlock`, `Operator`; `GrowthBounds`, `enclose_growth`, `growth_near_one`, `growth_with_slope`, `proves_decay`,
 `stationary_moments`; `stein`; `weighted_sum`, `rounded_number`; `congruence`.
 Guarantees: a radius between `low` and `high` for every operator within the radii of its matrices.
 Does not: build the matrices (see `class_moments` and `self_substitution`).
@@ -321,6 +321,21 @@ def enclose_growth(operator: Operator, *, bounded: bool = True) -> GrowthBounds:
             low = lower
         width *= WIDER_BOUNDS
     return GrowthBounds(radius, low or 0.0, np.inf if high is None else high)
+
+
+def growth_near_one(operator: Operator) -> float:
+    """Return an estimate of the growth factor of second moments that is on the same side of 1; in floats.
+
+    Notes
+    -----
+    Above the growth factor m of the means, 1/ρ − 1 is nearly a straight line (see `_growth_by_noise`). The
+    line through its pole at m and its value at 1 is 0 at m + (1 − m) ρ(1): one gain instead of a dozen.
+    """
+    operator = operator.balanced
+    deviation = _deviation(operator, 1.0) if operator.means < 1 else -1.0
+    if deviation == -1.0:
+        return enclose_growth(operator, bounded=False).radius
+    return float(operator.means + (1 - operator.means) / (1 + deviation))
 
 
 def growth_with_slope(operator: Operator) -> tuple[float, float]:

@@ -10,7 +10,7 @@ linearization: `moment_evaluator` returns a `RadiusEvaluator` then.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,7 +30,12 @@ from apc.mean_square.class_moments import (
 )
 from apc.mean_square.mean_dynamics import RouteMemory
 from apc.mean_square.mean_square_stability import MOST_WORK, independent_channels
-from apc.mean_square.second_moment_operator import enclose_growth, growth_with_slope
+from apc.mean_square.second_moment_operator import (
+    Operator,
+    enclose_growth,
+    growth_near_one,
+    growth_with_slope,
+)
 from apc.network.nominal_criterion import channel_numbers
 from apc.parameter_values.parameter_names import ParameterRef, value_now
 from apc.studies.crossing import Verdict
@@ -61,9 +66,19 @@ class MomentEvaluator(RadiusEvaluator):
 
     def verdict(self, value: Sequence[float], *, bounded: bool = False) -> Verdict:
         """Return the verdict at a point (m,); undecided if the point has no value."""
+        if bounded:
+            return RadiusEvaluator.verdict(self, value, bounded=True)
+        return self._verdict(value, lambda operator: enclose_growth(operator, bounded=False).radius)
+
+    def quick_verdict(self, value: Sequence[float]) -> Verdict:
+        """Return the verdict at a point (m,); its radius is an estimate on the same side of 1."""
+        return self._verdict(value, growth_near_one)
+
+    def _verdict(self, value: Sequence[float], growth: Callable[[Operator], float]) -> Verdict:
+        """Return the verdict at a point (m,) by this function of the second-moment map."""
         point = np.array([value], dtype=np.float64)
-        if bounded or not self._is_regular(point):
-            return RadiusEvaluator.verdict(self, value, bounded=bounded)
+        if not self._is_regular(point):
+            return RadiusEvaluator.verdict(self, value)
         if not self._allowed(point).all():
             return OPEN
         try:
@@ -72,7 +87,7 @@ class MomentEvaluator(RadiusEvaluator):
             if error.mistakes[0].code not in NOWHERE:
                 raise
             return OPEN
-        radius = enclose_growth(moments.operator, bounded=False).radius
+        radius = growth(moments.operator)
         return Verdict(radius < 1, radius, 0.0, (), BOUNDED[MEAN_SQUARE]) if np.isfinite(radius) else OPEN
 
     def slopes(self, values: Floats, along: Floats) -> tuple[tuple[Floats, Floats], ...]:

@@ -216,6 +216,10 @@ class RadiusEvaluator:
                 raise
             return OPEN
 
+    def quick_verdict(self, value: Sequence[float]) -> Verdict:
+        """Return the verdict at a point (m,) without bounds; its radius may be an estimate."""
+        return self.verdict(value)
+
     def dominant(self, value: Sequence[float]) -> complex:
         """Return the dominant eigenvalue at a point (m,), or the criterion's value."""
         if self.criterion != NOMINAL:
@@ -307,8 +311,12 @@ class PointwisePath(SingleSegment):
     def _quick_verdict(self, value: Fraction) -> Verdict:
         """Return the verdict at a value, without error bounds if they take longer."""
         if float(value) not in self.cached:
-            bounded = self.source.criterion == NOMINAL  # an analysis avoids matrices that are too large
-            self.cached[float(value)] = self.source.verdict([float(value)], bounded=bounded)
+            # An analysis avoids matrices that are too large.
+            nominal = self.source.criterion == NOMINAL
+            point = [float(value)]
+            self.cached[float(value)] = (
+                self.source.verdict(point, bounded=True) if nominal else self.source.quick_verdict(point)
+            )
         return self.cached[float(value)]
 
     def verdict_at(self, value: Fraction) -> Verdict:

@@ -84,3 +84,16 @@ def test_a_stiff_contact_is_evaluated_as_by_analyses(lossy: apc.Model) -> None:
     for stiffness in (2500.0, 12500 / 3, 5000.0):
         value = (stiffness, 125.0)
         assert evaluator.verdict(value).radius == pytest.approx(analyses.verdict(value).radius, rel=1e-12)
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.05, 0.6])
+def test_the_estimated_growth_is_on_the_same_side_of_one(lossy: apc.Model, loss: float) -> None:
+    """Stable and unstable points; no estimate is twice as far from 1 as the growth."""
+    model = apc.set_parameters(lossy, {"links.lan.loss": loss})
+    _, evaluator = evaluators(model, *PARAMETERS)
+    points = 10 + np.array([4500.0, 3000.0]) * np.random.default_rng(1).random((40, 2))
+    pairs = [(evaluator.verdict(point), evaluator.quick_verdict(point)) for point in points.tolist()]
+    assert {found.stable for found, _ in pairs} == {False, True}
+    for found, estimate in pairs:
+        assert estimate.stable is found.stable
+        assert abs(estimate.radius - found.radius) <= abs(found.radius - 1)

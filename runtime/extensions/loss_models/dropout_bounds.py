@@ -222,12 +222,14 @@ def _gap_sequences() -> dict[int, list[tuple[int, ...]]]:
     sequences: set[tuple[int, ...]] = set()
     for frames in range(1, FRAMES + 1):
         for losses in itertools.product((0, 1), repeat=frames - 1):
-            received = [index for index, number in enumerate((*losses, 0)) if not number]
-            sequences.add(tuple(np.diff([-1, *received]).tolist()))
+            received = [-1, *(index for index, number in enumerate((*losses, 0)) if not number)]
+            sequences.add(tuple(after - before for before, after in itertools.pairwise(received)))
     for count in range(1, GAPS + 1):
         sequences |= set(itertools.product(range(1, LONGEST + 1), repeat=count))
     sequences |= {(*(1,) * short, long) for long in range(2, LONE + 1) for short in range(SHORT)}
-    rotations_removed = {min(word[k:] + word[:k] for k in range(len(word))) for word in sequences}
+    # The first of all rotations starts with a shortest gap.
+    starting = (word for word in sequences if word[0] == min(word))
+    rotations_removed = {min(word[k:] + word[:k] for k in range(len(word))) for word in starting}
     by_losses: dict[int, list[tuple[int, ...]]] = {}
     for word in sorted(rotations_removed, key=lambda word: (sum(word), word)):
         by_losses.setdefault(max(word) - 1, []).append(word)
