@@ -174,20 +174,11 @@ def _si_number(name: str, value: float) -> Fraction:
     return Fraction(value) if isinstance(value, Rational) else Fraction(repr(float(value)))
 
 
-def _quantity(system: Model, name: str, value: str | float) -> str:
-    """Return a quantity as text; a number is in SI units."""
-    if isinstance(value, str):
-        return value
-    from apc.parameter_values.parameter_names import find, unit_of
-
-    number = _si_number(name, value)
-    shown = number.numerator if number.denominator == 1 else float(number)
-    return f"{shown!r} {unit_of(system, find(system, name, counts=True).name)}".rstrip()
-
-
-def _range(system: Model, name: str, value: str | Sequence[str | float]) -> str:
-    """Return a parameter range as text, from a text or from the two ends."""
-    return value if isinstance(value, str) else ":".join(_quantity(system, name, end) for end in value)
+def _values(name: str, given: str | Sequence[str | float]) -> str | list[str | Fraction]:
+    """Return values of a parameter, or the ends of its range: text, or texts and exact numbers in SI."""
+    if isinstance(given, str):
+        return given
+    return [item if isinstance(item, str) else _si_number(name, item) for item in given]
 
 
 @checked
@@ -556,10 +547,8 @@ def fit(
 
     system, extension = _model(model, params), require_extension("parameter_fit")
     chosen = DEFAULT if method is None else parse_method(method)
-    texts = [f"{name}={_range(system, name, value)}" for name, value in free.items()]
-    result: ParameterFit = extension.fit(
-        system, Path(recording), extension.read_free(system, texts), signals=signals, method=chosen
-    )
+    ranges = extension.read_free(system, [(name, _values(name, value)) for name, value in free.items()])
+    result: ParameterFit = extension.fit(system, Path(recording), ranges, signals=signals, method=chosen)
     return result
 
 
@@ -751,7 +740,7 @@ def robust_stability(
     from apc.studies.parameter_ranges import parse_range
 
     system = _model(model, params)
-    ranges = [parse_range(system, f"{name}={_range(system, name, value)}") for name, value in box.items()]
+    ranges = [parse_range(system, (name, _values(name, value))) for name, value in box.items()]
     return robust_stability(system, ranges, cells=cells)
 
 
@@ -829,7 +818,7 @@ def region(
 
     system = _model(model, params, operating_point)
     first, second = (
-        axis if axis is None or isinstance(axis, str) else f"{axis[0]}={_range(system, axis[0], axis[1:])}"
+        axis if axis is None or isinstance(axis, str) else (axis[0], _values(axis[0], axis[1:]))
         for axis in (x, y)
     )
     axes = parse_axes(system, first, second)
@@ -960,7 +949,7 @@ def _tuning_spec(
     if criterion is None:
         system, used_criterion = gripped_as_studied(system)
     ranges, required = (
-        [f"{name}={_range(system, name, value)}" for name, value in (named_ranges or {}).items()]
+        [(name, _values(name, value)) for name, value in (named_ranges or {}).items()]
         for named_ranges in (free, over)
     )
     tuning_spec = read_tuning_spec(
@@ -1013,10 +1002,7 @@ def sweep(
     path = None if out is None else Path(out)
     system = _model(model, params)
     _check_out(model, system, path)
-    values = {
-        name: text if isinstance(text, str) else [_quantity(system, name, value) for value in text]
-        for name, text in over.items()
-    }
+    values = {name: _values(name, given) for name, given in over.items()}
     return resumable_sweep.sweep(
         system, values, of=of, criterion=criterion, out=path, jobs=jobs, cluster=cluster
     )

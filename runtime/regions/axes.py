@@ -14,9 +14,10 @@ from fractions import Fraction
 from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.wording import with_unit
-from apc.parameter_values.parameter_names import Range, overlap, proposed_range, unit_of
+from apc.parameter_values.parameter_names import Range, overlap, proposed_range
 from apc.studies.grid import parse_axis
 from apc.studies.timing_values import refuse_phase
+from apc.support.option_value import NamedValues, named_values
 
 LOCATION = SourceLocation("region")
 
@@ -27,7 +28,7 @@ _FORM = "contact.stiffness=10 N/m:3000 N/m"
 
 
 def parse_axes(
-    system: Model, x: str | None, y: str | None, *, scale: Fraction = Fraction(1)
+    system: Model, x: str | NamedValues | None, y: str | NamedValues | None, *, scale: Fraction = Fraction(1)
 ) -> tuple[Range, Range]:
     """Return the two axes of a region from texts `PATH=LOW:HIGH`, by default the model's own axes.
 
@@ -36,7 +37,8 @@ def parse_axes(
     system
         The model.
     x, y
-        Texts such as `contact.stiffness=10 N/m:3000 N/m`; None is the axis of `studies: region:`.
+        Texts such as `contact.stiffness=10 N/m:3000 N/m`, or names with the two ends; None is the axis of
+        `studies: region:`.
     scale
         The divisor of the range of y.
 
@@ -47,23 +49,19 @@ def parse_axes(
         cannot be an axis, or a range too narrow for floats; E622, E881, E204, E624 as for `grid.parse_axis`.
     """
     intervals = []
-    for letter, text, index in (("x", x, 0), ("y", y, 1)):
-        if text is None and len(system.region) == 2:
+    for letter, given, index in (("x", x, 0), ("y", y, 1)):
+        if given is None and len(system.region) == 2:
             local = system.region[index]
-            unit = unit_of(system, local.parameter)
-            text = f"{local.parameter}={float(local.low)!r} {unit}:{float(local.high)!r} {unit}"
-        if text is None:
+            given = local.parameter, (local.low, local.high)
+        if given is None:
             message = f"--{letter} is missing, and the topology has no studies.region"
-            given_axis = (y if letter == "x" else x) or ""
-            other = given_axis.partition("=")[0].strip()
+            other = named_values((y if letter == "x" else x) or "")[0]
             fix = f'--{letter} "{proposed_range(system, without=other)}"'
             raise ApcError(Diagnostic("E901", LOCATION, message, fix=fix))
-        name, equals, span = (part.strip() for part in text.partition("="))
-        if not (equals and name and span.count(":") == 1):
-            fix = f'--{letter} "{_FORM}"'
-            raise ApcError(
-                Diagnostic("E901", LOCATION, f"--{letter}", "PATH=LOW:HIGH", text[:80] or "nothing", fix)
-            )
+        name, span = named_values(given)
+        if not name or (span.count(":") != 1 if isinstance(span, str) else len(span) != 2):
+            fix, got = f'--{letter} "{_FORM}"', str(given)[:80] or "nothing"
+            raise ApcError(Diagnostic("E901", LOCATION, f"--{letter}", "PATH=LOW:HIGH", got, fix))
         try:
             axis = parse_axis(system, name, span, ends=True)
         except ApcError as error:

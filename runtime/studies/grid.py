@@ -10,7 +10,7 @@ Does not: compute points.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 
@@ -24,7 +24,7 @@ from apc.parameter_values.overrides import Override, apply
 from apc.parameter_values.parameter_names import ParameterRef, find, unit_of
 from apc.studies.count_range import whole_range
 from apc.studies.evaluator import reaches_count
-from apc.support.option_value import option_values, with_last_unit
+from apc.support.option_value import Values, option_values, text_of, with_last_unit
 
 LOCATION = SourceLocation("sweep")
 
@@ -93,10 +93,13 @@ def build_grid(axes: Sequence[GridAxis]) -> Grid:
     return Grid(tuple(axes))
 
 
-def check_size(texts: Sequence[str]) -> None:
-    """Raise E883 for a grid that is too large by the texts of its axes, before any value is built."""
+def check_size(given: Iterable[Values]) -> None:
+    """Raise E883 for a grid that is too large by the values of its axes, before any value is built."""
     counts = []
-    for text in texts:
+    for text in given:
+        if not isinstance(text, str):
+            counts.append(len(text))
+            continue
         parts = [part.strip() for part in text.split(":")]
         count_texts = [part for part in parts[2:3] if part.isascii() and part.isdecimal()]
         if len(parts) == 1:
@@ -116,8 +119,8 @@ def _refuse_many(counts: Sequence[int]) -> None:
         raise ApcError(Diagnostic("E883", LOCATION, "sweep", f"at most {MOST_POINTS:,} points", got))
 
 
-def parse_axis(system: Model, name: str, text: str, *, ends: bool = False) -> GridAxis:
-    """Return the axis of a swept parameter from the text of its values.
+def parse_axis(system: Model, name: str, given: Values, *, ends: bool = False) -> GridAxis:
+    """Return the axis of a swept parameter from its values.
 
     Parameters
     ----------
@@ -125,11 +128,12 @@ def parse_axis(system: Model, name: str, text: str, *, ends: bool = False) -> Gr
         The compiled model.
     name
         A parameter or timing, as in `--set`.
-    text
-        `LOW:HIGH`, `LOW:HIGH:COUNT`, `LOW:HIGH:COUNT:log` (equal ratios instead of equal steps), or a list
-        `V1, V2, V3`. A number without a unit takes the unit of the last one: `0,8 ms`.
+    given
+        A text `LOW:HIGH`, `LOW:HIGH:COUNT`, `LOW:HIGH:COUNT:log` (equal ratios instead of equal steps) or
+        `V1, V2, V3`, or a list of texts and numbers in SI. A text without a unit takes the unit of the last
+        one: `0,8 ms`.
     ends
-        Whether the values are only the two ends of `LOW:HIGH`.
+        Whether the values are only the two ends of a range.
 
     Raises
     ------
@@ -141,13 +145,15 @@ def parse_axis(system: Model, name: str, text: str, *, ends: bool = False) -> Gr
     unit = unit_of(system, parameter_ref.name)
     is_count = reaches_count(system, parameter_ref)
     default = 2 if ends else DEFAULT_COUNT
-    values = (
-        _values_of_range(parameter_ref.label, unit, text, default)
-        if ":" in text
-        else _values_of_list(parameter_ref.label, unit, text)
-    )
-    if is_count and ":" in text:
-        values = _whole_numbers(parameter_ref.label, values, every=text.count(":") == 1 and not ends)
+    in_range = given if isinstance(given, str) and ":" in given else ""
+    if ends or in_range:
+        parts = in_range.split(":") if in_range else given
+        values = _values_of_range(parameter_ref.label, unit, parts[:2], in_range.split(":")[2:], default)
+    else:
+        items = given.split(",") if isinstance(given, str) else given
+        values = _values_of_list(parameter_ref.label, unit, items)
+    if is_count and (ends or in_range):
+        values = _whole_numbers(parameter_ref.label, values, every=in_range.count(":") == 1 and not ends)
     axis = GridAxis(parameter_ref, unit, values)
     for value in (min(values), max(values)):
         _check_bounds(system, axis, value)
@@ -166,48 +172,67 @@ def _whole_numbers(label: str, values: Sequence[Fraction], *, every: bool) -> tu
     return tuple(dict.fromkeys(Fraction(round(value)) for value in values))
 
 
-def _values_of_list(label: str, unit: str, text: str) -> tuple[Fraction, ...]:
-    """Return the values of a list `V1, V2, V3` in SI; an error E881 for a repeated value."""
-    texts = with_last_unit(text.split(","))
-    values = option_values(label, unit, texts, LOCATION, between=",")
-    for index, value in enumerate(values):
-        if value in values[:index]:
-            got = with_unit(f"{float(value):g}", unit) + " twice"
-            texts_once = [item for place, item in enumerate(texts) if values[place] not in values[:place]]
-            fix = f"{label}={', '.join(texts_once)}"
-            raise ApcError(Diagnostic("E881", LOCATION, f"list of {label}", "different values", got, fix))
+def _values_of_list(label: str, unit: str, items: Sequence[str | Fraction]) -> tuple[Fraction, ...]:
+    """Return the values of a list in SI; an error E881 for a repeated value."""
+    if not items:
+        raise ApcError(Diagnostic("E881", LOCATION, f"list of {label}", "1 value or more", "nothing", _FORM))
+    values = option_values(label, unit, items, LOCATION, between=",")
+    once = dict.fromkeys(values)
+    if len(once) < len(values):
+        repeated = next(value for place, value in enumerate(values) if value in values[:place])
+        got = with_unit(f"{float(repeated):g}", unit) + " twice"
+        texts = [text_of(items[values.index(value)], unit) for value in once]
+        fix = f"{label}={', '.join(with_last_unit(texts))}"
+        raise ApcError(Diagnostic("E881", LOCATION, f"list of {label}", "different values", got, fix))
     return values
 
 
-def _values_of_range(label: str, unit: str, text: str, default: int) -> tuple[Fraction, ...]:
+def _values_of_range(
+    label: str, unit: str, ends: Sequence[str | Fraction], given_options: Sequence[str], default: int
+) -> tuple[Fraction, ...]:
     """Return the values of a range LOW:HIGH (with the default count), LOW:HIGH:COUNT or
     LOW:HIGH:COUNT:log.
+
+    Parameters
+    ----------
+    label, unit
+        The parameter, and a valid unit.
+    ends, given_options
+        The two ends, and the texts after them.
+    default
+        The default number of values.
     """
-    message = f"range of {label}"
-    ends, options = text.split(":")[:2], text.split(":")[2:]
+    message, options = f"range of {label}", list(given_options)
     logarithmic = bool(options) and options[-1].strip() == "log"
     if logarithmic:
         options = options[:-1]
     if len(options) > 1:
         raise ApcError(
-            Diagnostic("E881", LOCATION, message, "LOW:HIGH:COUNT or LOW:HIGH:COUNT:log", text[:80], _FORM)
+            Diagnostic(
+                "E881",
+                LOCATION,
+                message,
+                "LOW:HIGH:COUNT or LOW:HIGH:COUNT:log",
+                ":".join([*(text_of(end, unit) for end in ends), *given_options])[:80],
+                _FORM,
+            )
         )
     count = _count(message, options[0].strip()) if options else default
-    low, high = option_values(
-        label, unit, ends, LOCATION, rest="".join(f":{part}" for part in text.split(":")[2:])
-    )
+    rest = "".join(f":{part.strip()}" for part in given_options)
+    low, high = option_values(label, unit, ends, LOCATION, rest=rest)
+    low_text, high_text = (text_of(end, unit) for end in ends)
     if low >= high:
-        got = f"{ends[0].strip()} to {ends[1].strip()}"
+        got = f"{low_text} to {high_text}"
         expected = "the lower end first"
-        rest = "".join(f":{part.strip()}" for part in (text.split(":")[2:]))
-        swapped = f"{label}={':'.join(reversed(with_last_unit(ends)))}{rest}" if low > high else ""
+        swapped = ":".join(reversed(with_last_unit([low_text, high_text])))
+        swapped = f"{label}={swapped}{rest}" if low > high else ""
         raise ApcError(Diagnostic("E881", LOCATION, message, expected, got, swapped))
     if not logarithmic:
         return tuple(low + (high - low) * step / (count - 1) for step in range(count))
     if low <= 0:
         got, expected = with_unit(f"{float(low):g}", unit), "a lower end above 0 for a logarithmic range"
         above_zero = with_unit(f"{float(high) / 100:g}", unit)
-        fix = f"{label}={above_zero}:{ends[1].strip()}:{count}:log" if high > 0 else ""
+        fix = f"{label}={above_zero}:{high_text}:{count}:log" if high > 0 else ""
         raise ApcError(Diagnostic("E881", LOCATION, message, expected, got, fix))
     ratio = float(high / low)
     # Inner values are shortest decimals of floats, for exact tables; the ends are the given values.

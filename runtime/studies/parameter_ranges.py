@@ -26,18 +26,18 @@ from apc.parameter_values.parameter_names import (
 )
 from apc.parameter_values.parameters import scope_of
 from apc.studies.representative_delays import LOCATION
-from apc.support.option_value import option_values
+from apc.support.option_value import NamedValues, named_values, option_values, text_of
 
 
-def parse_range(system: Model, text: str, location: SourceLocation = LOCATION) -> Range:
+def parse_range(system: Model, given: str | NamedValues, location: SourceLocation = LOCATION) -> Range:
     """Return the range that a text `NAME=±P%` or `NAME=LOW UNIT:HIGH UNIT` gives to a parameter.
 
     Parameters
     ----------
     system
         The compiled model.
-    text
-        The text; the name as in `parameter_names.find`.
+    given
+        The text, or the name and the two ends; the name as in `parameter_names.find`.
     location
         The location of the text, for errors: an option such as `--box`, which is a part of their fixes.
 
@@ -47,16 +47,19 @@ def parse_range(system: Model, text: str, location: SourceLocation = LOCATION) -
         E830 another form of text, E831 a parameter that cannot vary in a box, E833 invalid limits; the
         errors of `parameter_names.find` and `units.quantity`.
     """
-    name, _, value = (part.strip() for part in text.partition("="))
+    name, values = named_values(given)
+    value = values if isinstance(values, str) else " to ".join(text_of(end, "1") for end in values)
     if not name:
-        raise _malformed("range", text, proposed_range(system), location)
+        raise _malformed("range", value, proposed_range(system), location)
     parameter_ref = find(system, name, location)
     parameter = _parameter(system, parameter_ref, location)
     proposed = proposed_range_of(system, parameter_ref)
     malformed = _malformed(f"range of {name}", value, proposed, location)
-    if not value:
+    if not value or (not isinstance(values, str) and len(values) != 2):
         raise malformed
-    if value.startswith(("±", "+-")):
+    if not isinstance(values, str):
+        low, high = option_values(name, parameter.unit, values, location)
+    elif value.startswith(("±", "+-")):
         share = _percentage(value.removeprefix("±").removeprefix("+-"))
         if share is None:
             raise malformed

@@ -42,6 +42,7 @@ from apc.studies.stability_criteria import (
 )
 from apc.studies.work import Computed, Work, compute_part, program_versions
 from apc.support.memory import refuse_beyond
+from apc.support.option_value import Values
 from apc.support.processes import (
     Patience,
     Workers,
@@ -146,7 +147,7 @@ CELL = 32
 @part("points")
 def sweep(
     system: Model,
-    over: Mapping[str, str | Sequence[str]],
+    over: Mapping[str, Values],
     *,
     of: str = "analyze",
     criterion: str | None = None,
@@ -164,8 +165,8 @@ def sweep(
         The compiled topology; its values hold for the parameters that are not swept.
     over
         The values of each swept parameter by its name: a range `"0 N/m:3000 N/m:31"` (`LOW:HIGH:COUNT`, and
-        `:log` for equal ratios), or a list, `"0,8 ms"` or `["0 ms", "8 ms"]`. The last parameter varies
-        fastest.
+        `:log` for equal ratios), or a list, `"0,8 ms"` or `["0 ms", "8 ms"]` or numbers in SI. The last
+        parameter varies fastest.
     of
         The quantity to compute, see `quantities.QUANTITIES`: `analyze`, …
     criterion
@@ -190,9 +191,8 @@ def sweep(
         has the name of something else; E878, E887 or E601 the target cannot be written; E888 the cluster;
         E889 a process ended, or no result came in time. Finished parts remain stored.
     """
-    texts = {name: text if isinstance(text, str) else ",".join(text) for name, text in over.items()}
-    check_size(list(texts.values()))
-    grid = build_grid([parse_axis(system, name, text) for name, text in texts.items()])
+    check_size(over.values())
+    grid = build_grid([parse_axis(system, name, values) for name, values in over.items()])
     chosen_criterion = criterion_of(system, criterion, LOCATION, [axis.free for axis in grid.axes])
     work_of = by_criterion(of, chosen_criterion)
     quantity = find_quantity(system, work_of)

@@ -1,6 +1,7 @@
-"""Quantities as values of command-line options.
+"""Quantities as values of command-line options and of arguments.
 
-Takes: an option's name and its text. Gives: `option_value`, `option_values`, `with_last_unit`.
+Takes: an option's name and its text. Gives: `option_value`, `option_values`, `with_last_unit`; `NamedValues`,
+`named_values`, `text_of`.
 Guarantees: errors are located at the option, with a fix.
 Does not: define options.
 """
@@ -13,9 +14,27 @@ from dataclasses import replace
 from fractions import Fraction
 
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
+from apc.compiler.wording import with_unit
+
+# Values of a parameter: a text such as "0 N/m:100 N/m" or "0,8 ms", or texts and numbers in SI.
+Values = str | Sequence[str | Fraction]
+NamedValues = tuple[str, Values]
 
 
-def option_value(option: str, text: str, *, subject: str, unit: str) -> Fraction:
+def named_values(given: str | NamedValues) -> NamedValues:
+    """Return the name and the values of a text `NAME=VALUES`, or of such a pair."""
+    if not isinstance(given, str):
+        return given
+    name, _, values = (part.strip() for part in given.partition("="))
+    return name, values
+
+
+def text_of(value: str | Fraction, unit: str) -> str:
+    """Return a value as text, a number in SI with its unit."""
+    return value.strip() if isinstance(value, str) else with_unit(f"{float(value):.15g}", unit)
+
+
+def option_value(option: str, text: str | Fraction, *, subject: str, unit: str) -> Fraction:
     """Return the quantity given to an option, in SI units.
 
     Parameters
@@ -23,7 +42,7 @@ def option_value(option: str, text: str, *, subject: str, unit: str) -> Fraction
     option
         The option as written, such as "--duration".
     text
-        The given text.
+        The given text, or a number in SI.
     subject
         The name of the quantity, for messages.
     unit
@@ -34,6 +53,8 @@ def option_value(option: str, text: str, *, subject: str, unit: str) -> Fraction
     ApcError
         The errors of `units.quantity`.
     """
+    if isinstance(text, Fraction):
+        return text
     # Imported here: the language of quantities, which most commands do not need.
     from apc.compiler.language.units import quantity
 
@@ -58,7 +79,7 @@ def with_last_unit(texts: Sequence[str]) -> list[str]:
 def option_values(
     label: str,
     unit: str,
-    texts: Sequence[str],
+    texts: Sequence[str | Fraction],
     location: SourceLocation,
     *,
     between: str = ":",
@@ -71,7 +92,7 @@ def option_values(
     label, unit
         The name of the quantity, and a valid unit.
     texts
-        The texts of the quantities.
+        The texts of the quantities, or numbers in SI.
     location
         The location of the option.
     between, rest
@@ -82,16 +103,25 @@ def option_values(
     ApcError
         The errors of `units.quantity`, with a fix for the entire value.
     """
+    written = [text for text in texts if isinstance(text, str)]
+    if not written:
+        return tuple(Fraction(number) for number in texts)
     from apc.compiler.language.units import quantity
 
-    if unit != "1" and all(_NUMBER.fullmatch(text) for text in texts):
-        fix = f"{label}={between.join(f'{text.strip()} {unit}' for text in texts)}{rest}"
-        got = f"{between.join(texts)} (no unit)"
+    if unit != "1" and all(_NUMBER.fullmatch(text) for text in written):
+        fix = f"{label}={between.join(f'{text.strip()} {unit}' for text in written)}{rest}"
+        got = f"{between.join(written)} (no unit)"
         raise ApcError(Diagnostic("E204", location, label, unit, got[:80], fix))
     values: list[Fraction] = []
     mistakes: list[Diagnostic] = []
     corrected: list[str] = []  # the corrected text of each quantity
-    for text in with_last_unit(texts):
+    with_units = iter(with_last_unit(written))
+    for item in texts:
+        if isinstance(item, Fraction):
+            values.append(item)
+            corrected.append(text_of(item, unit))
+            continue
+        text = next(with_units)
         try:
             parsed = quantity(text, location, subject=label, unit=unit, before="", one_fix=True)
             values.append(Fraction(parsed.value))

@@ -42,7 +42,7 @@ from apc.studies.stability_criteria import (
     refuse_timing_parameter,
 )
 from apc.support.extension_table import require_extension
-from apc.support.option_value import option_value
+from apc.support.option_value import NamedValues, Values, named_values, option_value, text_of
 
 LOCATION = SourceLocation("tune")
 FREE, CONSTRAINT, OVER, TRADEOFF = (
@@ -193,12 +193,12 @@ class TuningSpec:
 
 def read_tuning_spec(
     system: Model,
-    free: Sequence[str] = (),
+    free: Sequence[str | NamedValues] = (),
     *,
     maximize: str = "",
     minimize: str = "",
     constraint: Sequence[str] = (),
-    over: Sequence[str] = (),
+    over: Sequence[str | NamedValues] = (),
     criterion: str | None = None,
 ) -> TuningSpec:
     """Return the specification from texts; omitted items are those of the topology's `studies: tune:`.
@@ -227,10 +227,9 @@ def read_tuning_spec(
         E995 no free parameter, or a free time or number of peers; E996 an unknown objective or demand; E842,
         and the errors of `parameter_ranges.parse_range`: an invalid range; E831 a parameter with two ranges.
     """
-    free, constraint, over = (
-        given or [text for word, text in system.tune if word == key]
-        for key, given in (("free", free), ("subject", constraint), ("over", over))
-    )
+    by_study = {key: [text for word, text in system.tune if word == key] for key, _ in system.tune}
+    free, over = free or by_study.get("free", []), over or by_study.get("over", [])
+    constraint = constraint or by_study.get("subject", [])
     if not (maximize or minimize):
         maximize, minimize = (dict(system.tune).get(key, "") for key in ("maximize", "minimize"))
     if not free:
@@ -309,9 +308,9 @@ def read_seconds(text: str) -> float:
     return float(number)
 
 
-def _parse_gain(system: Model, text: str) -> Range:
+def _parse_gain(system: Model, given: str | NamedValues) -> Range:
     """Return the range of a gain; an error E995 for a delay or a number of peers."""
-    name = text.partition("=")[0].strip()
+    name = named_values(given)[0]
     if name:
         parameter_ref = find(system, name, FREE, counts=True)
         is_count = reaches_count(system, parameter_ref)
@@ -319,23 +318,26 @@ def _parse_gain(system: Model, text: str) -> Range:
             message = f"{parameter_ref.label} can't be tuned continuously"
             proposed = f"{parameter_ref.label}=2:10" if is_count else proposed_range_of(system, parameter_ref)
             raise ApcError(Diagnostic("E995", FREE, message, fix=pasted(OVER, proposed)))
-    return _parse_range(system, text, FREE)
+    return _parse_range(system, given, FREE)
 
 
-def _parse_range(system: Model, text: str, location: SourceLocation) -> Range:
+def _parse_range(system: Model, given: str | NamedValues, location: SourceLocation) -> Range:
     """Return a range of a parameter or of a number of peers; errors are located at the option."""
-    name = text.partition("=")[0].strip()
+    name, values = named_values(given)
     parameter_ref = find(system, name, location, counts=True) if name else None
     if parameter_ref is not None and reaches_count(system, parameter_ref):
-        return _count_range(system, parameter_ref, text, location)
-    return parse_range(system, text, location)
+        return _count_range(system, parameter_ref, values, location)
+    return parse_range(system, given, location)
 
 
-def _count_range(system: Model, parameter_ref: ParameterRef, text: str, location: SourceLocation) -> Range:
-    """Return a range of numbers of peers from a text; an error E830 or E842 for an invalid range."""
-    ends = [part.strip() for part in text.partition("=")[2].split(":")]
-    if len(ends) != 2 or not all(ends):
-        subject, got = f"range of {parameter_ref.label}", text.partition("=")[2][:80] or "nothing"
+def _count_range(
+    system: Model, parameter_ref: ParameterRef, values: Values, location: SourceLocation
+) -> Range:
+    """Return a range of numbers of peers from its values; an error E830 or E842 for an invalid range."""
+    ends = [part.strip() for part in values.split(":")] if isinstance(values, str) else list(values)
+    if len(ends) != 2 or "" in ends:
+        subject = f"range of {parameter_ref.label}"
+        got = ":".join(text_of(end, "1") for end in ends)[:80] or "nothing"
         fix = pasted(location, f"{parameter_ref.label}=2:10")
         raise ApcError(Diagnostic("E830", location, subject, "LOW:HIGH", got, fix))
     end_values = [option_value(location.file, end, subject=parameter_ref.label, unit="1") for end in ends]

@@ -41,6 +41,7 @@ from apc.simulation.settings import DEFAULT, Method, Settings
 from apc.simulation.simulation import check_length, prepare
 from apc.studies.parameter_ranges import parse_range
 from apc.studies.representative_delays import is_delay
+from apc.support.option_value import NamedValues, named_values
 from apc.support.threads import load_pool
 
 Floats = NDArray[np.float64]
@@ -145,8 +146,8 @@ class ParameterFit(Result):
         return self._plotted(ax, style=style)
 
 
-def read_free(system: Model, texts: Sequence[str]) -> tuple[Range, ...]:
-    """Return the free parameters of texts `NAME=LOW:HIGH`.
+def read_free(system: Model, given: Sequence[str | NamedValues]) -> tuple[Range, ...]:
+    """Return the free parameters of texts `NAME=LOW:HIGH`, or of names with the two ends.
 
     Raises
     ------
@@ -154,16 +155,16 @@ def read_free(system: Model, texts: Sequence[str]) -> tuple[Range, ...]:
         E714 there is none, a parameter is given twice or is a delay, or its value is outside its range; and
         the errors of `parse_range`.
     """
-    if not texts:
+    if not given:
         message, fix = "no free parameter", f'--free "{proposed_range(system)}"'
         raise ApcError(Diagnostic("E714", FREE, message, fix=fix))
     free: list[Range] = []
-    for text in texts:
-        name = text.partition("=")[0].strip()
+    for named in given:
+        name = named_values(named)[0]
         if name and is_delay(system, find(system, name, FREE)):
             message = f"{name} is a delay: the order of events changes with it"
             raise ApcError(Diagnostic("E714", FREE, message, advice="fit it to packets with apc network"))
-        item = parse_range(system, text, FREE)
+        item = parse_range(system, named, FREE)
         label, value = item.free.label, value_now(system, item.free)
         if any(overlap(system, item.free, other.free) for other in free):
             raise ApcError(Diagnostic("E714", FREE, f"{label} has two ranges"))
