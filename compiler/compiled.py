@@ -321,8 +321,8 @@ class Replaced:
 class PeerType:
     """All peers with the same structure. `derivative(x, u, p, t) -> dx/dt (n_x,)`.
 
-    A float value of a parameter is exact, except for parameters in `rounded`: (index in `parameters`, exact
-    rational values); different values have different floats. `hands` are the parts in the section `hands`
+    A float value of a parameter is exact, except for the sum of weights that a peer receives over a link with
+    arcs: different sums have different floats. `hands` are the parts in the section `hands`
     whose force depends on their motion; `held` are the parts that a hand is connected to, or without hands
     the parts with a connector for hands. `linear` is the peer type in a linear analysis, with the same states
     and parameters, None if it is the same; `replaced` are the parts with other equations there. `symbols` are
@@ -338,7 +338,6 @@ class PeerType:
     clocks: tuple[ClockPartition, ...]
     sends: tuple[SendPartition, ...]
     ports: ForcePorts | None = None
-    rounded: tuple[tuple[int, tuple[Fraction, ...]], ...] = ()
     hands: tuple[str, ...] = ()
     limits: tuple[Limit, ...] = ()
     held: tuple[str, ...] = ()

@@ -45,9 +45,9 @@ from apc.compiler.functions.topology_data import (
     check_links,
     compiled_groups,
     followers_of,
+    refuse_equal_sums,
     used_clocks,
     used_links,
-    with_rounded,
 )
 from apc.compiler.language.dimensions import Dimension
 from apc.compiler.language.expression import format_expression, names
@@ -113,6 +113,8 @@ def build_functions(system: SortedSystem, origin: Origin, *, linear: SortedSyste
         (link.name, "its packets are not received") for link in topology.links if link.name not in used
     ]
     dropped += [(clock.name, "it is not used") for clock in topology.clocks if clock.name not in used]
+    for peer_type in peer_types:
+        refuse_equal_sums(topology, peer_type, links)
     parameters = all_parameters(topology, peer_types, links)
     groups = compiled_groups(topology, peer_types, locations, links, timings)
     return Model(
@@ -122,7 +124,7 @@ def build_functions(system: SortedSystem, origin: Origin, *, linear: SortedSyste
         links,
         timings.result,
         parameters,
-        tuple(with_rounded(topology, peer_type, links) for peer_type in peer_types),
+        tuple(peer_types),
         groups,
         tuple(dict.fromkeys(dropped)),
         origin,

@@ -1,7 +1,7 @@
 """Parameters, groups and communication graphs of a compiled model: all except its functions.
 
 Takes: `Topology`, and the peer types with their functions. Gives: `Timings`; `used_links`, `check_links`,
-`used_clocks`; `compiled_groups`, `with_rounded`; `all_parameters`, `followers_of`.
+`used_clocks`; `compiled_groups`, `refuse_equal_sums`; `all_parameters`, `followers_of`.
 Guarantees: periods, phases and delays are exact; dependent values have their formulas.
 Does not: build functions.
 """
@@ -313,29 +313,16 @@ def compiled_groups(
     return with_received(groups, peer_types, links)
 
 
-def with_rounded(topology: Topology, peer_type: PeerType, links: Sequence[Link]) -> PeerType:
-    """Return a peer type with the numbers of senders whose floats are rounded, and their exact values.
-
-    Raises
-    ------
-    ApcError
-        E217 different sums of weights that are equal in floats.
-    """
+def refuse_equal_sums(topology: Topology, peer_type: PeerType, links: Sequence[Link]) -> None:
+    """Raise E217 if different sums of weights received by peers of a type are equal in floats."""
     locations = {link.name: link.location for link in topology.links}
-    rounded = []
     for link in links:
         if count_of(link.name) in peer_type.parameters and link.graph.shape == "arcs":
             values = set(received_sums(link, topology.peers).tolist())
             if len(set(map(float, values))) < len(values):
                 message = f"two sums of weights over {link.name} differ by less than rounding"
-                raise ApcError(
-                    Diagnostic(
-                        "E217", locations[link.name], message, advice="use weights of at most 15 digits"
-                    )
-                )
-            if any(Fraction(float(value)) != value for value in values):
-                rounded.append((peer_type.parameters.index(count_of(link.name)), tuple(sorted(values))))
-    return replace(peer_type, rounded=tuple(rounded))
+                advice = "use weights of at most 15 digits"
+                raise ApcError(Diagnostic("E217", locations[link.name], message, advice=advice))
 
 
 # ---- numbers by name ----

@@ -36,7 +36,7 @@ from apc.lifting.discretize import coupled_states
 from apc.linearization.jacobians import SubsystemJacobians, edge_name, structural_pattern
 from apc.linearization.linearize import start_arguments, start_values
 from apc.parameter_values.exact_arithmetic import evaluate_exact
-from apc.parameter_values.parameters import exact_numbers
+from apc.parameter_values.parameters import rationals
 from apc.simulation.flow import flow_of, rows_to_move, state_scales
 from apc.simulation.program import timed_events
 from apc.simulation.propagate import rates, transition_rows
@@ -407,7 +407,7 @@ def _forces(
     x, u, p, t = peer_type.derivative.sx_in()
     slopes = jacobian(peer_type.derivative(x, u, p, t), u)
     varying = casadi.vertcat(x, u, t)
-    numbers = start_arguments(subsystem, exact_numbers(peer_type, vector), Fraction, None)
+    numbers = start_arguments(subsystem, rationals(vector), Fraction, None)
     forces = []
     for row in sorted(outside):
         if not _is_position(peer_type, subsystem, row):

@@ -40,7 +40,7 @@ from apc.linearization.jacobians import SubsystemJacobians, jacobians
 from apc.linearization.linearize import InitialReception, start_arguments
 from apc.parameter_values.exact_arithmetic import evaluate_exact
 from apc.parameter_values.overrides import apply, parse_override
-from apc.parameter_values.parameters import exact_numbers, resolve
+from apc.parameter_values.parameters import rationals, resolve
 
 if TYPE_CHECKING:
     from apc.compiler.components.component import Component
@@ -148,9 +148,7 @@ def find_devices(
         return {}
     sent_parts = _sent_parts(subsystem)
     masses = tuple(index for index, name in enumerate(peer_type.parameters) if unit_of.get(name) == "kg")
-    x, u, _, _, p, t = start_arguments(
-        subsystem, exact_numbers(peer_type, parameters), Fraction, initial_reception
-    )
+    x, u, _, _, p, t = start_arguments(subsystem, rationals(parameters), Fraction, initial_reception)
     peers = peer_type.parameters.index(PEERS) if PEERS in peer_type.parameters else None
     variables = masses if peers is None else (*masses, peers)
     result: dict[str, Device | str] = {}
@@ -294,9 +292,7 @@ def find_push(
     if reason is None or len(driven) != 1 or len(masses) != 1 or not subsystem.walkable:
         return reason
     velocity, mass = int(driven[0]), masses[0]
-    x, u, _, _, p, t = start_arguments(
-        subsystem, exact_numbers(peer_type, parameters), Fraction, initial_reception
-    )
+    x, u, _, _, p, t = start_arguments(subsystem, rationals(parameters), Fraction, initial_reception)
     peers = peer_type.parameters.index(PEERS) if PEERS in peer_type.parameters else None
     variables = (mass,) if peers is None else (mass, peers)
     slopes, change, *by_peers = evaluate_exact(_slopes(peer_type, velocity, variables), [x, u, p, t])

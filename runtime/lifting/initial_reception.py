@@ -19,7 +19,6 @@ from apc.lifting.model_numbers import ModelNumbers, PeerIndices
 from apc.linearization.jacobians import edge_name
 from apc.linearization.linearize import InitialReception, start_sends, start_values
 from apc.parameter_values.exact_arithmetic import evaluate_exact
-from apc.parameter_values.parameters import exact_numbers
 from apc.timing.communication_graph import check_mean
 
 # The gain of a receive for each sender's channel, by (edge, channel): one for all senders, or one per group.
@@ -45,10 +44,10 @@ class StartClasses:
         exact: dict[tuple[int, bytes], tuple[list[Fraction], dict[str, list[Fraction]]]] = {}
         self.parameters: list[list[Fraction]] = []
         self.sent: list[dict[str, list[Fraction]]] = []
-        for subsystem, peer_type, vector in zip(self.subsystems, self.peer_types, self.vectors, strict=True):
-            key = (peer_type, vector.tobytes())
+        for subsystem, peer_type, peer in zip(self.subsystems, self.peer_types, self.peers, strict=True):
+            key = (peer_type, numeric.vector(peer).tobytes())
             if key not in exact:
-                parameters = exact_numbers(subsystem.peer_type, vector)
+                parameters = numeric.exact_vector(peer)
                 exact[key] = parameters, start_sends(subsystem, parameters)
             self.parameters.append(exact[key][0])
             self.sent.append(exact[key][1])

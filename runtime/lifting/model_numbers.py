@@ -18,9 +18,10 @@ from typing import Any, Concatenate, ParamSpec, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.compiled import Model
+from apc.compiler.compiled import Model, count_of
+from apc.compiler.peer_counts import received_sums
 from apc.linearization.jacobians import SubsystemJacobians
-from apc.parameter_values.parameters import ResolvedNumbers, resolve
+from apc.parameter_values.parameters import ResolvedNumbers, rationals, resolve
 from apc.timing.communication_graph import CommunicationGraph, build_exchange
 from apc.timing.schedule import ORDER, Schedule
 from apc.timing.scheduling import build_schedules
@@ -120,6 +121,21 @@ class ModelNumbers:
         group = self.exchange.group_of(peer)
         row = self.numbers.rows[group][peer - self.exchange.starts[group]]
         return np.asarray(self.numbers.parameters[group][row])
+
+    @cached_property
+    def weight_sums(self) -> dict[str, NDArray[Any]]:
+        """The exact sum of the weights that each peer receives (N,), by the parameter of a link with arcs."""
+        links = (link for link in self.model.links if link.graph.shape == "arcs")
+        return {count_of(link.name): received_sums(link, self.exchange.peers) for link in links}
+
+    def exact_vector(self, peer: int) -> list[Fraction]:
+        """Return the parameters (n_p,) of a peer exactly: its floats, and its sums of weights."""
+        group = self.model.groups[self.exchange.group_of(peer)]
+        names = self.model.peer_types[group.peer_type].parameters
+        return [
+            self.weight_sums[name][peer] if name in self.weight_sums else number
+            for name, number in zip(names, rationals(self.vector(peer)), strict=True)
+        ]
 
 
 def cached_in_model(

@@ -27,10 +27,10 @@ from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.linearization.evaluation_errors import part_of
 from apc.linearization.jacobians import SubsystemJacobians
 from apc.linearization.kinks import refuse_kinks, tie_indicators
-from apc.linearization.linear_subsystem import LinearSubsystem, assemble, cut, every_matrix, with_local_parts
+from apc.linearization.linear_subsystem import LinearSubsystem, assemble, cut, with_local_parts
 from apc.parameter_values.exact_arithmetic import evaluate_exact
 from apc.parameter_values.parameter_names import ParameterRef
-from apc.parameter_values.parameters import exact_numbers, scope_of
+from apc.parameter_values.parameters import scope_of
 
 # Cached peer types at their start, and batch functions of subsystems.
 CACHE_SIZE = 64
@@ -220,19 +220,14 @@ def linearize(
     parameters
         The subsystem's parameters (n_p,), in the order of `PeerType.parameters`.
     initial_reception
-        The values received at the start. By default the other peers have the start values of this subsystem;
-        required for a subsystem with edge functions.
+        The values received at the start. By default the other peers have the start values of this subsystem.
     """
-    if initial_reception is not None and subsystem.edges:
-        # A sum of slopes over many peers: rounded once, whatever the cancellation.
-        exact = linearize_exact(subsystem, parameters, initial_reception)
-        return every_matrix(exact, lambda matrix: matrix.astype(np.float64))
     return subsystem_of(subsystem, _finite_slopes(subsystem, parameters, initial_reception))
 
 
 def linearize_exact(
     subsystem: SubsystemJacobians,
-    parameters: NDArray[np.float64],
+    parameters: Sequence[Fraction],
     initial_reception: InitialReception | None = None,
 ) -> LinearSubsystem:
     """Return the matrices of `linearize` in exact rationals, as object arrays of `Fraction`, and 0.
@@ -240,14 +235,13 @@ def linearize_exact(
     Parameters
     ----------
     subsystem, parameters, initial_reception
-        As for `linearize`.
+        As for `linearize`, the parameters as exact rationals. A subsystem with edge functions requires the
+        values received at the start.
     """
     assert initial_reception is not None or not subsystem.edges, "an edge function depends on the sender"
     assert subsystem.function.is_a("SXFunction"), "the solution of a nonlinear loop is no rational number"
-    _finite_slopes(subsystem, parameters, initial_reception)
-    arguments = start_arguments(
-        subsystem, exact_numbers(subsystem.peer_type, parameters), Fraction, initial_reception
-    )
+    _finite_slopes(subsystem, np.array(parameters, dtype=np.float64), initial_reception)
+    arguments = start_arguments(subsystem, [*parameters], Fraction, initial_reception)
     exact = subsystem_of_entries(subsystem, evaluate_exact(subsystem.function, arguments)[0], 0)
     if initial_reception is None:
         return exact

@@ -1,8 +1,8 @@
 """The second-moment map of a frame under random channel noise, with proved bounds of its spectral radius.
 
 Takes: state matrices, noise input matrices, and the linear forms that generate the noise.
-Gives: `MomentBlock`, `Operator`; `GrowthBounds`, `enclose_growth`, `growth_near_one`, `growth_with_slope`, `proves_decay`,
-`stationary_moments`; `stein`; `weighted_sum`, `rounded_number`; `congruence`.
+Gives: `MomentBlock`, `Operator`; `GrowthBounds`, `enclose_growth`, `growth_near_one`, `growth_with_slope`,
+`proves_decay`, `stationary_moments`; `stein`; `weighted_sum`, `rounded_number`; `congruence`.
 Guarantees: a radius between `low` and `high` for every operator within the radii of its matrices.
 Does not: build the matrices (see `class_moments` and `self_substitution`).
 

@@ -2,7 +2,7 @@
 
 Takes: a `Model`, and new values by name, in any number type.
 Gives: `ParameterScope`, `scope_of`, the one resolver of dependent parameters; `ResolvedNumbers`, `resolve`,
-`exact_numbers`; `columns_of`; `free_rows`, `free_values`; `with_times_of_groups`.
+`rationals`; `columns_of`; `free_rows`, `free_values`; `with_times_of_groups`.
 Guarantees: dependents of a changed value are computed in the order fixed at compilation; the others keep
 their compiled values. Peers with the same parameters share one row. Complex values are complex steps: the
 imaginary part is a derivative.
@@ -11,7 +11,6 @@ Does not: read or apply overrides, or check bounds (`overrides`); build a matrix
 
 from __future__ import annotations
 
-from bisect import bisect_left
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
@@ -20,7 +19,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.compiled import Formula, Group, Model, Parameter, PeerType, Timing
+from apc.compiler.compiled import Formula, Group, Model, Parameter, Timing
 from apc.compiler.errors import ApcError, Diagnostic
 from apc.compiler.language.evaluation import computed
 from apc.parameter_values.exact_arithmetic import ROWS
@@ -206,22 +205,9 @@ def _distinct_rows(system: Model, group: Group) -> tuple[Floats, NDArray[np.int6
     return parameters, rows
 
 
-def exact_numbers(peer_type: PeerType, vector: Floats) -> list[Fraction]:
-    """Return a peer's parameters (n_p,) exactly: floats, or the rationals that were rounded to these floats.
-
-    Parameters
-    ----------
-    peer_type
-        The peer's type, with the exact values of rounded parameters.
-    vector
-        The peer's parameters (n_p,), in the order of `PeerType.parameters`.
-    """
-    numbers = [Fraction(value) for value in vector.tolist()]
-    for index, rationals in peer_type.rounded:
-        near = bisect_left(rationals, vector[index], key=float)
-        assert float(rationals[near]) == vector[index], f"{peer_type.parameters[index]} is none of its values"
-        numbers[index] = rationals[near]
-    return numbers
+def rationals(vector: Floats) -> list[Fraction]:
+    """Return floats (n,) as exact rationals."""
+    return list(map(Fraction, vector.tolist()))
 
 
 def free_rows(

@@ -26,7 +26,7 @@ from apc.lifting.discretize import discretize
 from apc.lifting.interval_arithmetic import value_of
 from apc.linearization.jacobians import guards_of, structural_pattern
 from apc.parameter_values.exact_arithmetic import evaluate_exact
-from apc.parameter_values.parameters import exact_numbers
+from apc.parameter_values.parameters import rationals
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -136,9 +136,7 @@ def exact_rates(rates_of: Rates, parameters: Floats) -> NDArray[Any]:
     peer_type = rates_of.peer_type
     n_x, n_u = len(peer_type.states), len(peer_type.holds)
     if rates_of.matrices.is_a("SXFunction"):
-        exact = evaluate_exact(
-            rates_of.matrices, [exact_numbers(peer_type, np.asarray(parameters, dtype=np.float64))]
-        )[0]
+        exact = evaluate_exact(rates_of.matrices, [rationals(np.asarray(parameters, dtype=np.float64))])[0]
     else:
         exact = [Fraction(float(values)) for values in np.asarray(rates_of.matrices(parameters)).ravel()]
     return np.array(exact, dtype=object).reshape((n_x, n_x + n_u + 1), order="F")

@@ -29,7 +29,7 @@ from apc.lifting.model_numbers import PeerIndices, cached_in_model
 from apc.lifting.numeric_model import NumericModel
 from apc.linearization.evaluation_errors import at_part
 from apc.linearization.jacobians import SubsystemJacobians
-from apc.linearization.linear_subsystem import LinearSubsystem, rational_floats
+from apc.linearization.linear_subsystem import LinearSubsystem, every_matrix, rational_floats
 from apc.linearization.linearize import (
     InitialReception,
     linearize,
@@ -49,7 +49,8 @@ MOST_NAMED = 4
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PeerClass:
-    """`count` peers with equal motion; `parameters` is the vector (n_p,) of the first of them.
+    """`count` peers with equal motion; `parameters` is the vector (n_p,) of the first of them, also as
+    exact rationals.
 
     `peers` are the numbers of these peers in the model, from 0; `delay_class` is the model's group where it
     has delays of its own (see `CommunicationGraph.delay_class`); `index` identifies the class in its model,
@@ -60,6 +61,7 @@ class PeerClass:
     name: str
     count: int
     parameters: Floats
+    exact_parameters: tuple[Fraction, ...]
     jacobians: SubsystemJacobians
     subsystem: LinearSubsystem
     exact: LinearSubsystem
@@ -96,6 +98,11 @@ class PeerClass:
             return Fraction(1)
         gains = self.gains[coupling_term.edge, coupling_term.channel]
         return gains[0] if len(gains) == 1 else gains[sender.index]
+
+    def exact_at(self, vector: Floats) -> list[Fraction]:
+        """Return other parameters (n_p,) exactly; those with present values are the present ones."""
+        present = zip(self.parameters.tolist(), self.exact_parameters, vector.tolist(), strict=True)
+        return [exact if value == number else Fraction(value) for number, exact, value in present]
 
     def with_subsystem(
         self,
@@ -153,13 +160,19 @@ def build_group(
     group, vector = exchange.group_of(peers.first), numeric.vector(peers.first)
     jacobians, schedule = numeric.subsystems[group], numeric.schedules[group]
     check_packets(schedule)
-    subsystem = linearize(jacobians, vector, initial_reception)
-    # The functions of a nonlinear loop cannot be evaluated operation by operation.
-    exact = linearize_exact(jacobians, vector, initial_reception) if jacobians.walkable else None
+    exact_vector, exact = numeric.exact_vector(peers.first), None
+    if jacobians.walkable:  # the functions of a nonlinear loop cannot be evaluated operation by operation
+        exact = linearize_exact(jacobians, exact_vector, initial_reception)
+    if exact is not None and jacobians.edges:
+        # A sum of slopes over many peers: rounded once, whatever the cancellation.
+        subsystem = every_matrix(exact, lambda matrix: matrix.astype(np.float64))
+    else:
+        subsystem = linearize(jacobians, vector, initial_reception)
     return PeerClass(
         name=group_name(peers, exchange),
         count=len(peers),
         parameters=vector,
+        exact_parameters=tuple(exact_vector),
         jacobians=jacobians,
         subsystem=subsystem,
         exact=rational_floats(subsystem) if exact is None else exact,

@@ -26,7 +26,7 @@ from apc.linearization.jacobians import guards_of
 from apc.linearization.linear_subsystem import LinearSubsystem
 from apc.linearization.linearize import subsystem_of_entries
 from apc.parameter_values.exact_arithmetic import evaluate_exact, is_rational
-from apc.parameter_values.parameters import exact_numbers
+from apc.parameter_values.parameters import rationals
 from apc.spectrum.heterogeneous_peers import HeterogeneousGroup
 from apc.spectrum.interconnection import ModalSystem
 from apc.spectrum.modes import complete_loops
@@ -88,7 +88,7 @@ def _random_peer(population: HeterogeneousGroup) -> LinearSubsystem | None:
     symbols = jacobians.function.sx_in()
     if not is_rational(jacobians.function) or guards_of(jacobians.function(*symbols), symbols[4]):
         return None
-    vector, random = exact_numbers(jacobians.peer_type, numbers[0]), Random(0)
+    vector, random = rationals(numbers[0]), Random(0)
     for index in np.flatnonzero((numbers != numbers[0]).any(axis=0)):
         vector[index] = Fraction(random.randrange(1, LARGEST), LARGEST)
     arguments = [[Fraction(0)] * size for size in map(jacobians.function.numel_in, range(4))]

@@ -205,7 +205,7 @@ class BatchEvaluator:
         """
         used = {group.index for system in systems for group in system.subsystems}
         at_value = {
-            group.index: (vector, linearize_exact(group.jacobians, vector))
+            group.index: (vector, linearize_exact(group.jacobians, group.exact_at(vector)))
             for group, vector in self._parameters_at(value)
             if group.index in used
         }
@@ -213,7 +213,8 @@ class BatchEvaluator:
         def at_point(group: PeerClass) -> PeerClass:
             """Return a class with the parameters and the exact subsystem of the point."""
             vector, exact = at_value[group.index]
-            return replace(group, parameters=vector, exact=exact)
+            numbers = tuple(group.exact_at(vector))
+            return replace(group, parameters=vector, exact_parameters=numbers, exact=exact)
 
         return tuple(
             replace(system, subsystems=tuple(map(at_point, system.subsystems))) for system in systems

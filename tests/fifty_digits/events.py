@@ -4,7 +4,7 @@ Takes: a `Model`.
 Gives: `Peer`, `build_peers`; `Happening`, `Play`; `refusal`, `ticks_between`.
 Guarantees: shares with the analysis and the simulation what says what the topology is, and nothing that says
 what it does: no Jacobian of theirs, no schedule, no lifted map, no mode. Shared are the compiled functions;
-the numbers of each peer (`parameters.resolve`, `exact_numbers`); the walk through a function's operations
+the numbers of each peer (`parameters.resolve`); the walk through a function's operations
 over exact numbers and whether that is possible (`exact.evaluate_exact`, `is_rational`, `guards.guards_of`);
 how a rational becomes a ball (`balls.rational_ball`, `precision`); and in `truth` who hears whom on
 a graph (`exchange.arcs`) and the row of a topology without clocks (`simulation.ROW`). A mistake in one of
@@ -28,11 +28,11 @@ import casadi
 import flint
 import numpy as np
 
-from apc.compiler.compiled import Model, PeerType
+from apc.compiler.compiled import Model, PeerType, count_of
 from apc.compiler.interpolation import jacobian
 from apc.linearization.jacobians import guards_of
 from apc.parameter_values.exact_arithmetic import evaluate_exact, is_rational
-from apc.parameter_values.parameters import exact_numbers, resolve
+from apc.parameter_values.parameters import resolve
 from apc.spectrum.ball_arithmetic import rational_ball
 
 Number = Any  # flint.arb, an exact 0 or 1, or an array of these
@@ -225,6 +225,24 @@ def _rationals(rows: Sequence[Sequence[Fraction]]) -> Any:
     return flint.fmpq_mat(len(rows), len(rows), entries)
 
 
+def received_weights(system: Model, peer: int) -> dict[str, Fraction]:
+    """Return the exact sum of the weights that a peer receives over each link with arcs, by its parameter."""
+    return {
+        count_of(link.name): sum(
+            (
+                Fraction(repr(weight))
+                for (_, receiver), weight in zip(
+                    link.graph.arcs.tolist(), link.graph.weights.tolist(), strict=True
+                )
+                if receiver == peer
+            ),
+            Fraction(0),
+        )
+        for link in system.links
+        if link.graph.shape == "arcs"
+    }
+
+
 def build_peers(system: Model, peers: Sequence[int], groups: Sequence[int], *, linear: bool) -> list[Peer]:
     """Build some peers, at the present precision.
 
@@ -247,8 +265,9 @@ def build_peers(system: Model, peers: Sequence[int], groups: Sequence[int], *, l
         nonlinear = system.peer_types[system.groups[group].peer_type]
         peer_type = nonlinear.linear or nonlinear
         row = numbers.rows[group][peer - int(starts[group])]
-        parameters = exact_numbers(peer_type, numbers.parameters[group][row])
-        value = dict(zip(peer_type.parameters, parameters, strict=True))
+        parameters = list(map(Fraction, numbers.parameters[group][row].tolist()))
+        value = dict(zip(peer_type.parameters, parameters, strict=True)) | received_weights(system, peer)
+        parameters = [value[name] for name in peer_type.parameters]
         delays = tuple(seconds[hold.delay] for hold in peer_type.holds)
         start_x = tuple(value[state.start] for state in peer_type.states)
         start_m = tuple(tuple(value[name] for name in clock.starts) for clock in peer_type.clocks)

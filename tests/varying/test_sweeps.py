@@ -176,6 +176,11 @@ def test_a_range_or_list_gives_exact_values(text: str, values: list[Fraction]) -
     assert found.column("it.stiffness [N/m]").tolist() == [float(one) for one in values]
 
 
+def test_numbers_in_si_stay_exact_and_may_stand_with_quantities() -> None:
+    found = apc.sweep(WALL, {"it.stiffness": [Fraction(1000, 3), 0.1, "2 N/mm"]}, jobs=1)
+    assert found.grid.axes[0].values == (Fraction(1000, 3), Fraction(1, 10), 2000)
+
+
 FORM = "--over contact.stiffness='100 N/m:3000 N/m:30'"
 RANGE = "E881 range of contact.stiffness: expected "
 MANY = "E883 sweep: expected at most 10,000,000 points, got "
@@ -221,6 +226,18 @@ MANY = "E883 sweep: expected at most 10,000,000 points, got "
         (
             {"contact.stiffness": "1,2 N/m", "couplers.contact.stiffness": "3,4 N/m"},
             "E883 contact.stiffness is swept twice.",
+        ),
+        (
+            {"contact.stiffness": []},
+            f"E881 list of contact.stiffness: expected 1 value or more, got nothing. Try: {FORM}",
+        ),
+        (
+            {"contact.stiffness": [3.0, "5 N"]},
+            "E204 contact.stiffness: expected N/m, got 5 N. Try: contact.stiffness=3 N/m,5 N/m",
+        ),
+        (
+            {"contact.stiffness": [3.0, "5"]},
+            "E204 contact.stiffness: expected N/m, got 5 (no unit). Try: contact.stiffness=5 N/m",
         ),
         # Before any value is built, which would take seconds and gigabytes.
         (

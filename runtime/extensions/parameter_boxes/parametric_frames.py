@@ -25,7 +25,7 @@ from apc.linearization.linear_subsystem import LinearSubsystem
 from apc.network.nominal_criterion import refuse_channel_number
 from apc.parameter_values.overrides import Override, apply
 from apc.parameter_values.parameter_names import Range, overlap, proposed_range
-from apc.parameter_values.parameters import exact_numbers, scope_of
+from apc.parameter_values.parameters import scope_of
 from apc.spectrum.interconnection import ClosedLoop
 from apc.spectrum.modes import split
 from apc.spectrum.peer_classes import PeerClass
@@ -190,10 +190,8 @@ _RULES: dict[str, Callable[..., Any]] = {
 def _parametric_subsystem(group: PeerClass, symbolic: Mapping[str, Ratio], system: Model) -> LinearSubsystem:
     """Return the matrices of a class of peers with the parameters of the box as symbols."""
     peer_type = group.jacobians.peer_type
-    exact_values = exact_numbers(peer_type, group.parameters)
-    vector = [
-        symbolic.get(name, value) for name, value in zip(peer_type.parameters, exact_values, strict=True)
-    ]
+    numbers = zip(peer_type.parameters, group.exact_parameters, strict=True)
+    vector = [symbolic.get(name, value) for name, value in numbers]
     try:
         return parametric_subsystem(group.jacobians, vector)
     except NotRational as reason:
