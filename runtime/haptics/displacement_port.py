@@ -27,7 +27,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.analysis.analysis import lifted_groups
-from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.lifting.devices import Device, coupled_directly, find_device, no_device
 from apc.lifting.frame_inputs import FrameInputs, with_holds, with_ports
@@ -42,13 +41,12 @@ from apc.lifting.interval_arithmetic import (
 from apc.lifting.numeric_model import NumericModel
 from apc.linearization.linear_subsystem import LinearSubsystem
 from apc.spectrum.interconnection import ModalSystem, close_loop
-from apc.spectrum.modes import decompose, dense_loop
-from apc.spectrum.peer_classes import PeerClass, states_of
+from apc.spectrum.modes import accepted_loops
+from apc.spectrum.peer_classes import PeerClass
 from apc.spectrum.relative_coordinates import relative_coordinates, relative_rows, with_uncertainty
 from apc.spectrum.rigid_modes import find_rigid_modes
 from apc.support.not_supported import NotSupportedError
 from apc.support.state_limits import MATRIX_STATES
-from apc.timing.communication_graph import CommunicationGraph
 from apc.timing.schedule import HoldUpdate, Propagate, Schedule, SendEvent, Tick
 
 Floats = NDArray[np.float64]
@@ -158,7 +156,9 @@ def port_loops(numeric: NumericModel, *, option: str) -> tuple[PortLoop, ...]:
         with_inputs.append(device_input.group)
     if not device_inputs:
         raise no_device(system, option)
-    loops, weighted = _energy_loops(system, with_inputs, exchange, option=option)
+    used = {received.coupling_term.link for group in groups for received in group.schedule.received}
+    is_orthogonal = all(exchange.links[link].graph.shape in ORTHOGONAL for link in used)
+    loops, weighted = accepted_loops(with_inputs, exchange, lambda _: is_orthogonal, option)
     result = []
     for loop in loops:
         # A loop without devices is one of the model with its devices clamped.
@@ -271,25 +271,6 @@ def _without_device_states(subsystem: LinearSubsystem, device: Device) -> Linear
     for send, full_send in zip(linear_subsystem.sends, subsystem.sends, strict=True):
         send.u[:, -1] = full_send.x[:, device.position]
     return linear_subsystem
-
-
-def _energy_loops(
-    system: Model, groups: Sequence[PeerClass], exchange: CommunicationGraph, *, option: str
-) -> tuple[tuple[ModalSystem, ...], bool]:
-    """Return loops that exchange no energy, and whether a subsystem represents all peers of its count."""
-    used = {received.coupling_term.link for group in groups for received in group.schedule.received}
-    if all(exchange.links[link].graph.shape in ORTHOGONAL for link in used):
-        decomposed = decompose(groups, exchange)
-        if decomposed.method == "modes":
-            return decomposed.loops, True
-    states = sum(group.count * states_of(group.schedule, group.jacobians) for group in groups)
-    if states > MATRIX_STATES:
-        message = f"{exchange.peers:,} peers on this graph form one system of {states:,} states and intervals"
-        advice = f"use equal peers on complete graphs or rings, or at most {MATRIX_STATES:,} states in total"
-        raise ApcError(
-            Diagnostic("E933", SourceLocation(system.origin.topology), f"{option}: {message}", advice=advice)
-        )
-    return (dense_loop(groups, exchange),), False
 
 
 def _port_loop(

@@ -30,10 +30,9 @@ from apc.lifting.devices import LOCAL_MASS, Device, coupled_directly, find_devic
 from apc.lifting.interval_arithmetic import MIDPOINT_RADIUS, UNIT_ROUNDOFF, with_error_radius
 from apc.lifting.numeric_model import NumericModel
 from apc.spectrum.interconnection import ModalSystem
-from apc.spectrum.modes import decompose, dense_loop
+from apc.spectrum.modes import accepted_loops
 from apc.spectrum.peer_classes import PeerClass
 from apc.spectrum.rigid_modes import find_rigid_modes
-from apc.support.state_limits import MATRIX_STATES
 from apc.timing.communication_graph import CommunicationGraph
 
 Floats = NDArray[np.float64]
@@ -92,8 +91,8 @@ def responses(numeric: NumericModel, port: DevicePort, other: DevicePort) -> Res
         driven_classes.append(peer_group)
         subsystems[peer_group.index] = subsystem
     plain, driven_loops = (
-        _loops_by_class(system, groups, exchange),
-        _loops_by_class(system, driven_classes, exchange),
+        accepted_loops(classes, exchange, _are_by_class, "apc transparency")[0]
+        for classes in (groups, driven_classes)
     )
     common = driven_loops[0]
     if (states := sum(len(subsystem.z_names) for subsystem in common.subsystems)) > MOST_TOGETHER:
@@ -173,30 +172,9 @@ def _check_increments(system: Model, group: PeerClass) -> None:
         raise ApcError(Diagnostic("E933", SourceLocation(system.origin.topology), message, advice=advice))
 
 
-def _loops_by_class(
-    system: Model, groups: Sequence[PeerClass], exchange: CommunicationGraph
-) -> tuple[ModalSystem, ...]:
-    """Return one loop of all classes of equal peers and a difference loop for each, or one loop of
-    all peers.
-    """
-    decomposed = decompose(groups, exchange)
-    common, *difference_loops = decomposed.loops
-    if decomposed.method == "modes" and _are_difference_loops(common, difference_loops):
-        return common, *difference_loops
-    states = sum(group.count * len(group.z_names) for group in groups)
-    if states > MATRIX_STATES:
-        message = f"{exchange.peers:,} peers on this graph form one system of {states:,} states and samples"
-        advice = f"use complete graphs, or at most {MATRIX_STATES:,} states in total"
-        raise ApcError(
-            Diagnostic(
-                "E933", SourceLocation(system.origin.topology), f"apc transparency: {message}", advice=advice
-            )
-        )
-    return (dense_loop(groups, exchange),)
-
-
-def _are_difference_loops(common: ModalSystem, difference_loops: Sequence[ModalSystem]) -> bool:
-    """Return whether the other loops are one difference loop per class; a ring has other modes."""
+def _are_by_class(loops: Sequence[ModalSystem]) -> bool:
+    """Return whether loops are a common loop and a difference loop per class; a ring has other modes."""
+    common, *difference_loops = loops
     many = {subsystem.name: subsystem.count - 1 for subsystem in common.subsystems}
     return all(
         len(loop.subsystems) == 1 and loop.multiplicity == many.get(loop.subsystems[0].name)

@@ -1,8 +1,8 @@
 """Modal decomposition: a complete system as few and small independent loops.
 
 Takes: the groups of equal peers of a model, and the links between them.
-Gives: `split`; `ModalDecomposition`, `decompose`; `orthogonal_loops`; `complete_loops`, `dense_loop`,
-`dense`, `refuse_dense`, `split_exchangeable`; `couple`, `complete_degrees`.
+Gives: `split`; `ModalDecomposition`, `decompose`; `accepted_loops`, `orthogonal_loops`; `complete_loops`,
+`dense_loop`, `dense`, `refuse_dense`, `split_exchangeable`; `couple`, `complete_degrees`.
 Guarantees: the systems of a split, each with its multiplicity, have together the spectrum of `dense`, for any
 number of peers. Weights are exact; a mean over no peers, or with weights that sum to 0, raises an error.
 Does not: compute eigenvalues (see `spectrum`); find symmetries of different peers other than a permutation of
@@ -28,6 +28,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.weights import exact_weight
 from apc.lifting.model_numbers import PeerIndices
 from apc.spectrum.graph_loops import common_graph, graph_loop, graph_scale
@@ -108,6 +109,39 @@ def decompose(groups: Sequence[PeerClass], exchange: CommunicationGraph) -> Moda
         note = f"{len(parts)} subsystems (common and difference motions of interchangeable peers)"
         return ModalDecomposition("modes", parts, (note,))
     return ModalDecomposition("dense", parts, (f"all peers as one system: {reason}",))
+
+
+def accepted_loops(
+    groups: Sequence[PeerClass],
+    exchange: CommunicationGraph,
+    accepted: Callable[[tuple[ModalSystem, ...]], bool],
+    subject: str,
+) -> tuple[tuple[ModalSystem, ...], bool]:
+    """Return the independent loops if they are accepted, else one loop of all peers; and whether they are.
+
+    Parameters
+    ----------
+    groups, exchange
+        As for `split`.
+    accepted
+        Whether a question can be answered from these loops.
+    subject
+        The question, for messages.
+
+    Raises
+    ------
+    ApcError
+        E933 one loop of too many states.
+    """
+    decomposed = decompose(groups, exchange)
+    if decomposed.method == "modes" and accepted(decomposed.loops):
+        return decomposed.loops, True
+    states = sum(group.count * states_of(group.schedule, group.jacobians) for group in groups)
+    if states > MATRIX_STATES:
+        message = f"{subject}: {exchange.peers:,} peers on this graph form one system of {states:,} states"
+        advice = f"use equal peers on complete graphs, or at most {MATRIX_STATES:,} states in total"
+        raise ApcError(Diagnostic("E933", SourceLocation(exchange.topology), message, advice=advice))
+    return (dense_loop(groups, exchange),), False
 
 
 def orthogonal_loops(
