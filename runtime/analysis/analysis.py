@@ -2,7 +2,7 @@
 
 Takes: a `NumericModel`.
 Gives: `Analysis`, `analyze`; `prepare_at_start` for many analyses of one model; `lifted_groups`;
-`near_start`; `analyze_sides`, `analyze_worst_side`.
+`near_start`; `analyze_sides`, `analyze_worst_side`; `determinant_radius`.
 Guarantees: the cost grows with the number of different peers, not of all, and not with the length of a delay;
 equal input gives equal output.
 Does not: read files, or draw.
@@ -451,6 +451,19 @@ def _solve_closed(
     ):
         raise ApcError(Diagnostic("E806", SourceLocation(system.origin.topology), TOO_LARGE))
     return solve_spectrum(closed, certify=certify, exact_work=exact_work)
+
+
+def determinant_radius(numeric: NumericModel) -> float:
+    """Return the spectral radius in floats of a model whose verdict is that of the determinant method.
+
+    NaN for other methods, at a kink, or if a count of eigenvalues contradicts the radius.
+    """
+    if sides(numeric)[0].numeric is not numeric:
+        return math.nan
+    from apc.spectrum.determinant_spectrum import radius_in_floats  # most models need no determinant
+
+    plan = make_plan(numeric)
+    return radius_in_floats(plan.loops) if plan.method == "determinant" and plan.loops else math.nan
 
 
 def _solve_determinant(loops: Sequence[ModalSystem]) -> Spectrum:

@@ -1,7 +1,7 @@
 """The spectrum of a population from its characteristic function: bounds, verdict, dominant modes.
 
 Takes: loops with long delays, or populations of different peers on complete graphs.
-Gives: `solve_loops`, `solve_populations`.
+Gives: `solve_loops`, `solve_populations`; `radius_in_floats`.
 Guarantees: as `zeros`: the radius is bounded from both sides, without missed eigenvalues. A radius closer to
 1 than its bound is reported as undecided. Rigid modes are determined from the equations.
 Does not: list more than the largest modes.
@@ -28,7 +28,7 @@ from apc.spectrum.interconnection import ModalSystem, without_packets
 from apc.spectrum.rigid_modes import find_rigid_modes
 from apc.spectrum.spectrum import Mode, ModeMotion, Spectrum, combine_verdicts
 from apc.spectrum.transfer import CHUNK, TransferSubsystems
-from apc.spectrum.zeros import Zero, Zeros, find_zeros, near_poles
+from apc.spectrum.zeros import Zero, Zeros, find_zeros, largest_zero, near_poles
 from apc.timing.communication_graph import CommunicationGraph
 from apc.verdict import NO_PROOF
 
@@ -74,6 +74,22 @@ def solve_loops(loops: Sequence[ModalSystem]) -> Spectrum:
         The loops, each counted with its multiplicity.
     """
     return _spectrum([_solve_loop(loop) for loop in loops], [loop.multiplicity for loop in loops])
+
+
+def radius_in_floats(loops: Sequence[ModalSystem]) -> float:
+    """Return the spectral radius of independent loops in floats, on its true side of 1; NaN if unknown.
+
+    Parameters
+    ----------
+    loops
+        The loops.
+    """
+    radii = []
+    for loop in loops:
+        function, _ = loop_characteristic(loop.subsystems, loop.coupling, loop.weight_errors)
+        rigid = len(find_rigid_modes(without_packets(loop), with_drifts=False).names)
+        radii.append(largest_zero(function, _loop_starts(function), rigid=rigid))
+    return float(np.max(radii))  # NaN if one is
 
 
 def solve_populations(

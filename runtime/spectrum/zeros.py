@@ -1,7 +1,7 @@
 """The spectral radius from a characteristic function: zeros by Newton's method, proved by counting.
 
 Takes: a `Characteristic`, and start values of its zeros.
-Gives: `Zeros`, `find_zeros`, `near_poles`; `count_outside`, `bracket`; `Zero`.
+Gives: `Zeros`, `find_zeros`, `largest_zero`, `near_poles`; `count_outside`, `bracket`; `Zero`.
 Guarantees: `low` and `high` bound the spectral radius, rigid modes excluded. The argument principle proves
 one zero within a small circle about the largest zero, and none beyond a circle just outside it. Without a
 count the bounds are wider.
@@ -15,6 +15,7 @@ has a pole of lower order there, or none, and Newton's method does not find it; 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
@@ -58,6 +59,9 @@ SMALL_ARCS, SMALL_POINTS = 12, 300
 # The relative distance of the two circles that enclose the largest magnitude, the limit of counts to find
 # them, and the relative offset of the first circle.
 BRACKETED, MOST_COUNTS, ALONGSIDE = 1e-3, 40, 1e-6
+
+# The distance from the unit circle of the first circle that is counted to find its side.
+FIRST_OUTSIDE = 1e-9
 
 # Points from which a circle about a zero is searched, and circles tried from each.
 MOST_EVALUATIONS = 4
@@ -268,12 +272,8 @@ def find_zeros(
     """
     if not function.transfer.poles.errors.max(initial=0.0) < FARTHEST:
         return Zeros(0.0, float(np.inf), 0.0, (), False, not rigid)
-    least = _least_radius(function, 1.0, ASIDE)
-    rigid_radius = _rigid_radius(function, rigid, [least * WIDER**missed for missed in range(16)], 0.0)
-    exact = [zero for zero in _enclosed_poles(function) if abs(zero.value - 1) > rigid_radius]
     poles = near_poles(function, TAKEN_OUT)
-    close = near_poles(function, near) * (1 + 1e-7)
-    zeros = _distinct(refine(function, np.concatenate([starts, close]), poles=poles), rigid_radius)
+    zeros, exact, rigid_radius = _refined(function, starts, poles, rigid=rigid, near=near)
     # Newton's method finds a multiple zero only with the square root of the accuracy.
     wider = sorted((2 * np.abs(zeros - 1)[np.abs(zeros - 1) < WIDEST]).tolist(), reverse=True)
     rigid_radius = _rigid_radius(function, rigid, wider, rigid_radius)
@@ -307,6 +307,50 @@ def find_zeros(
     if not low <= radius <= high:
         radius = (low + high) / 2 if np.isfinite(high) else low
     return Zeros(low, high, radius, tuple(largest_zeros), not outside_count, rigid_radius < WIDEST)
+
+
+def _refined(
+    function: Characteristic, starts: Complexes, poles: Complexes, *, rigid: int, near: int
+) -> tuple[Complexes, list[Zero], float]:
+    """Return the zeros found from the starts, the eigenvalues of single subsystems, and a circle about 1.
+
+    Parameters
+    ----------
+    function, starts, rigid, near
+        As for `find_zeros`.
+    poles
+        The largest poles of f.
+    """
+    least = _least_radius(function, 1.0, ASIDE)
+    rigid_radius = _rigid_radius(function, rigid, [least * WIDER**missed for missed in range(16)], 0.0)
+    exact = [zero for zero in _enclosed_poles(function) if abs(zero.value - 1) > rigid_radius]
+    close = near_poles(function, near) * (1 + 1e-7)
+    zeros = _distinct(refine(function, np.concatenate([starts, close]), poles=poles), rigid_radius)
+    return zeros, exact, rigid_radius
+
+
+def largest_zero(function: Characteristic, starts: Complexes, *, rigid: int) -> float:
+    """Return the largest magnitude of an eigenvalue, without those at 1; NaN if a count contradicts it.
+
+    The magnitude is a float without a bound; its side of 1 agrees with the number of eigenvalues outside the
+    unit circle.
+
+    Parameters
+    ----------
+    function, starts, rigid
+        As for `find_zeros`.
+    """
+    if not function.transfer.poles.errors.max(initial=0.0) < FARTHEST:
+        return math.nan
+    poles = near_poles(function, TAKEN_OUT)
+    zeros, exact, rigid_radius = _refined(function, starts, poles, rigid=rigid, near=0)
+    if rigid_radius >= WIDEST:  # more eigenvalues are near 1, for example those of drifts
+        return math.nan
+    largest, _ = _largest(zeros, exact, lambda zero: 0.0)
+    _, outside = first_counted_circle(function, 1.0, FIRST_OUTSIDE, rigid, rigid_radius)
+    if outside > 0 and not largest > 1:  # an eigenvalue next to a pole, which Newton's method misses
+        largest = float(np.abs(poles).max(initial=0.0))
+    return largest if outside >= 0 and (outside > 0) == (largest > 1) else math.nan
 
 
 def _largest(

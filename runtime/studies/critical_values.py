@@ -36,6 +36,7 @@ from apc.parameter_values.parameter_names import (
     values_by_group,
 )
 from apc.result import PlotStyle, Result
+from apc.spectrum.peer_classes import states_of
 from apc.studies.clock_periods import NominalPeriodPath, PeriodPath
 from apc.studies.count_range import count_range
 from apc.studies.crossing import (
@@ -79,6 +80,7 @@ from apc.studies.stability_criteria import (
 )
 from apc.studies.timing_values import is_scaled, reaches_period, refuse_phase
 from apc.support.option_value import option_value
+from apc.support.state_limits import SEARCH_STATES
 from apc.support.threads import single_threaded
 from apc.verdict import Sentence, Term
 
@@ -399,6 +401,8 @@ def _path_without_times(numeric: NumericModel, parameter_ref: ParameterRef, ends
     """
     parameter = parameter_of(numeric.model, parameter_ref)
     low, high = ends
+    if many_packets(numeric) and max(map(states_of, numeric.schedules, numeric.subsystems)) > SEARCH_STATES:
+        return _pointwise_path(numeric, parameter_ref, ends, NOMINAL)
     try:
         evaluator = evaluator_of_many(numeric, [parameter_ref], _LOCATION)
     except ApcError:

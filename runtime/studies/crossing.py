@@ -66,6 +66,10 @@ NEWTON, BRENT, HALVINGS = 12, 200, 60
 # relative to the value or the smallest size.
 INWARDS = 1e-9
 
+# The logarithm of a spectral radius that an analysis decides without matrices, and the multiple of its error
+# from the crossing at which the others are decided.
+AWAY, CLEARLY = 1e-9, 1.03
+
 # The radius is discontinuous in a bracket narrower than this, relative to the value, if it changes by more
 # than this, beyond its errors.
 JUMP = 1e-6
@@ -770,10 +774,15 @@ def _crossing_in_floats(
             disp=False,
         )
     )
-    if segment.quick_at is None or log_radius_at(root)[0]:
+    if segment.quick_at is None:
+        return root, 0.0
+    at_root, error = log_radius_at(root)[0], segment.quick_at(Fraction(root)).error
+    if at_root and not math.isnan(error):
         return root, 0.0
     # By the slope to the nearest decided value.
-    decided = [point for point, (log_radius, _) in cached.items() if log_radius]
+    away = AWAY if math.isnan(error) else 0.0
+    decided = [point for point, (log_radius, _) in cached.items() if abs(log_radius) > away]
     nearest = min(decided, key=lambda point: abs(point - root))
-    error = segment.quick_at(Fraction(root)).error
-    return root, error * abs(nearest - root) / abs(cached[nearest][0])
+    if math.isnan(error):  # a radius without a bound: that of the analysis there
+        error = CLEARLY * segment.verdict_at(Fraction(nearest)).error
+    return root, error * abs((nearest - root) / (cached[nearest][0] - at_root))

@@ -21,7 +21,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import analyze
+from apc.analysis.analysis import analyze, determinant_radius
 from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.lifting.data_age import aged
@@ -217,8 +217,20 @@ class RadiusEvaluator:
             return OPEN
 
     def quick_verdict(self, value: Sequence[float]) -> Verdict:
-        """Return the verdict at a point (m,) without bounds; its radius may be an estimate."""
-        return self.verdict(value)
+        """Return the verdict at a point (m,), without bounds where they take longer.
+
+        Its radius may be an estimate on the same side of 1.
+        """
+        if self.criterion != NOMINAL:
+            return self.verdict(value)
+        try:
+            numeric = self.numeric.at(apply(self.system, overrides_at(self.system, self.free, value)))
+            radius = determinant_radius(numeric)
+        except ApcError:
+            return OPEN
+        if math.isfinite(radius):
+            return Verdict(radius < 1, radius, math.nan, (), NO_PROOF)
+        return self.verdict(value, bounded=True)  # an analysis avoids matrices that are too large
 
     def dominant(self, value: Sequence[float]) -> complex:
         """Return the dominant eigenvalue at a point (m,), or the criterion's value."""
@@ -311,18 +323,14 @@ class PointwisePath(SingleSegment):
     def _quick_verdict(self, value: Fraction) -> Verdict:
         """Return the verdict at a value, without error bounds if they take longer."""
         if float(value) not in self.cached:
-            # An analysis avoids matrices that are too large.
-            nominal = self.source.criterion == NOMINAL
-            point = [float(value)]
-            self.cached[float(value)] = (
-                self.source.verdict(point, bounded=True) if nominal else self.source.quick_verdict(point)
-            )
+            self.cached[float(value)] = self.source.quick_verdict([float(value)])
         return self.cached[float(value)]
 
     def verdict_at(self, value: Fraction) -> Verdict:
         """Return the verdict at a value, with error bounds."""
-        if self.source.criterion == NOMINAL:
-            return self._quick_verdict(value)
+        known = self.cached.get(float(value), OPEN)
+        if self.source.criterion == NOMINAL and math.isfinite(known.error):
+            return known  # an analysis
         return self.source.verdict([float(value)], bounded=True)
 
     def smooth_segments(self) -> Iterator[SmoothSegment]:

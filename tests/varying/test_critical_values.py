@@ -16,6 +16,7 @@ import pytest
 
 import apc
 from apc.__main__ import run
+from apc.analysis.analysis import analyze, determinant_radius
 from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError
 from apc.lifting.numeric_model import numeric_model
@@ -624,3 +625,17 @@ def test_the_evaluator_follows_from_what_a_parameter_changes(name: str, value: F
     scalar = evaluator_for(numeric, [parameter_ref], "mean-square")
     continuous = expected in (EvaluatorKind.MATRICES, EvaluatorKind.DELAYS)
     assert (scalar.kind, scalar.linearized) == (EvaluatorKind.POINTS if continuous else expected, ())
+
+
+def test_a_search_over_many_packets_evaluates_the_side_of_one_by_a_count() -> None:
+    """Analyses with bounds agree on the side at every value, and near the crossing on the radius."""
+    model = apc.set_parameters(compiled(AVERAGE), {"lan.delay": 2.4, "contact.stiffness": 0})
+    found = apc.critical(model, "coordination.stiffness", lower=1.0, upper=20_000.0)
+    assert len(found.crossings) == 1
+    for value in (2.0, 30.0, 60.0, 61.0, 200.0, 3000.0, 15_000.0):
+        numeric = numeric_model(apc.set_parameters(model, {"coordination.stiffness": value}))
+        quick, analysis = determinant_radius(numeric), analyze(numeric)
+        assert analysis.method == "determinant"
+        assert (quick < 1) is analysis.stable is (value < found.value)
+        if abs(analysis.spectral_radius - 1) < 0.01:
+            assert quick == pytest.approx(analysis.spectral_radius, abs=analysis.spectral_radius_error)
