@@ -24,7 +24,6 @@ that stay have deviations of opposite sign, and those that join and leave have n
 from __future__ import annotations
 
 import itertools
-import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
@@ -46,12 +45,11 @@ from apc.result import Result
 from apc.spectrum.eigenpairs import largest_magnitudes
 from apc.spectrum.enclosure import enclose_eigenvalues
 from apc.spectrum.kyp_bounds import is_positive
-from apc.spectrum.matrix_norms import balance
+from apc.spectrum.lyapunov_functions import balanced, decreases, has_common_function
 from apc.spectrum.modes import decompose, split
 from apc.spectrum.relative_coordinates import relative, with_uncertainty
 from apc.studies.grid import parse_axis
 from apc.studies.loop_structure import loop_structure
-from apc.support.optional import need
 from apc.support.threads import load_pool, single_threaded
 from apc.verdict import Term
 
@@ -246,54 +244,13 @@ def _motion_family(name: str, counts: Sequence[int], matrices: dict[int, Matrix]
     states = bounded[0].shape[-1]
     if not states:
         return MotionFamily(name, 0, True, 1, (), 0.0)
-    # Powers of two balance the rows and columns of all matrices together.
-    scale = balance(np.max([np.abs(value_of(matrix)) + error_radius(matrix) for matrix in bounded], axis=0))
-    scaled = [matrix / scale[:, None] * scale for matrix in bounded]
-    if _has_common_function(scaled):
+    scaled = balanced(bounded)
+    if has_common_function(scaled):
         return MotionFamily(name, states, True, 1, (), 0.0)
     sequence, growth = _growing_sequence(scaled)
     unstable = tuple(present[index] for index in sequence)
     dwell = None if len(unstable) == 1 else _dwell_frames(scaled)
     return MotionFamily(name, states, False, dwell, unstable, growth)
-
-
-def _decreases(before: Floats, matrix: Matrix, after: Floats) -> bool:
-    """Return whether P − Mᵀ L M ≻ 0 is proved, for P before a step M (2, n, n) and L after it."""
-    multiply, exact = MIDPOINT_RADIUS.multiply, MIDPOINT_RADIUS.exact
-    moved = multiply(np.swapaxes(matrix, -1, -2), multiply(exact(after), matrix))
-    return is_positive(MIDPOINT_RADIUS.subtract(exact(before), moved))
-
-
-def _has_common_function(matrices: Sequence[Matrix]) -> bool:
-    """Return whether one xᵀ P x is proved to decrease under each of some matrices (2, n, n).
-
-    P with P − Mᵀ P M ⪰ I is found by a semidefinite program, and then verified.
-    """
-    if any(value_of(matrix).size and _radius(matrix) >= 1 for matrix in matrices):
-        return False
-    cvxpy = need("cvxpy", "sdp")
-    n = matrices[0].shape[-1]
-    unknown = cvxpy.Variable((n, n), symmetric=True)
-    steps = [value_of(matrix) for matrix in matrices]
-    constraints = [unknown - step.T @ unknown @ step >> np.eye(n) for step in steps]
-    problem = cvxpy.Problem(cvxpy.Minimize(cvxpy.trace(unknown)), constraints)
-    try:
-        with warnings.catch_warnings():  # of an inaccurate solution, which is verified below
-            warnings.simplefilter("ignore")
-            problem.solve(solver=cvxpy.CLARABEL)
-    except cvxpy.error.SolverError:
-        return False
-    if unknown.value is None:
-        return False
-    function = np.asarray((unknown.value + unknown.value.T) / 2, dtype=np.float64)
-    return is_positive(MIDPOINT_RADIUS.exact(function)) and all(
-        _decreases(function, matrix, function) for matrix in matrices
-    )
-
-
-def _radius(matrix: Matrix) -> float:
-    """Return the spectral radius of a matrix (2, n, n) in floats."""
-    return float(largest_magnitudes(value_of(matrix)))
 
 
 def _dwell_frames(matrices: Sequence[Matrix]) -> int | None:
@@ -307,7 +264,7 @@ def _dwell_frames(matrices: Sequence[Matrix]) -> int | None:
     functions = [(function + function.T) / 2 for function in functions]
     pairs = list(zip(functions, matrices, strict=True))
     if not all(is_positive(MIDPOINT_RADIUS.exact(function)) for function in functions) or not all(
-        _decreases(function, matrix, function) for function, matrix in pairs
+        decreases(function, matrix, function) for function, matrix in pairs
     ):
         return None
 
@@ -315,7 +272,7 @@ def _dwell_frames(matrices: Sequence[Matrix]) -> int | None:
         """Return whether a number of frames between changes is proved to suffice."""
         powers = [_power(matrix, frames) for matrix in matrices]
         return all(
-            _decreases(before, power, after)
+            decreases(before, power, after)
             for (before, power), after in itertools.product(zip(functions, powers, strict=True), functions)
         )
 
