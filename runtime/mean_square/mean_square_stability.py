@@ -234,6 +234,9 @@ def _reason_not_supported(system: Model, lossy: Sequence[tuple[Link, ChannelLaw]
     """Return the reason why a network is not supported, "" if it is supported."""
     if why := next((why for link, _ in lossy if (why := _other_coupling(system, link))), ""):
         return why
+    for link, _ in lossy:
+        if link.graph.shape == "arcs" and (link.graph.arcs[:, 0] == link.graph.arcs[:, 1]).any():
+            return f"packets of {link.name} that a peer sends to itself"
     if any(law.trace is not None for _, law in lossy):
         if not all(law.trace is not None for _, law in lossy):
             return "recorded delays together with random loss or jitter of another link"
@@ -270,8 +273,6 @@ def _other_coupling(system: Model, link: Link) -> str:
         for receive in partition.receives
         if receive.link == link.name
     ]
-    if link.graph.shape == "arcs" and (link.graph.arcs[:, 0] == link.graph.arcs[:, 1]).any():
-        return f"packets of {link.name} that a peer sends to itself"
     if any(receive.age for receive in receives):
         return f"the random age of packets of {link.name}, which enters the equations"
     if any(receive.before for receive in receives):

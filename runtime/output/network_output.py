@@ -66,6 +66,8 @@ def _losses(losses_in_a_row: ConsecutiveLosses) -> Iterator[tuple[str, str]]:
     if certified is not None:
         most = f"certified stable up to {counted(certified, 'consecutive lost packet')}"
         yield "losses", most if certified else "no loss pattern is certified stable"
+    if losses_in_a_row.certificate is not None:
+        yield "  certificate", str(losses_in_a_row.certificate)
     pattern = "".join("×" if lost else "·" for lost in losses_in_a_row.unstable_pattern or ())
     growth = f"growth {losses_in_a_row.growth:.6g} per frame" if pattern else ""
     if "×" in pattern:

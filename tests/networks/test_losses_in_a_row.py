@@ -5,8 +5,10 @@ Reference numbers are of an independent program; patterns are also multiplied by
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -15,10 +17,12 @@ import pytest
 import apc
 from apc.__main__ import run
 from apc.compiler.errors import ApcError
-from apc.extensions.loss_models.dropout_bounds import ConsecutiveLosses, worst_case
+from apc.extensions.loss_models.dropout_bounds import worst_case
 from apc.lifting.numeric_model import numeric_model
+from apc.mean_square.loss_results import ConsecutiveLosses, LossCertificate
 from tests.held_topologies import frames, growth, system_of, topology
-from tests.topologies import replaced
+from tests.published.by_hand import held
+from tests.topologies import ROOT, replaced
 
 
 def losses(text: str) -> ConsecutiveLosses:
@@ -116,7 +120,8 @@ def test_groups_rings_and_stars_are_what_is_written_peer_by_peer_and_edge_by_edg
 @pytest.mark.parametrize("stiffness", [0.0, 1e-3])
 def test_who_feels_nothing_of_the_others_bears_any_losses(stiffness: float) -> None:
     note = "at least 1,000 consecutive losses are harmless; more were not analyzed"
-    assert losses(topology(3, stiffness)) == ConsecutiveLosses(1000, None, None, note)
+    found = ConsecutiveLosses(1000, None, None, note, LossCertificate.SMALL_GAIN)
+    assert losses(topology(3, stiffness)) == found
 
 
 TWICE = (
@@ -186,3 +191,70 @@ def test_the_command_plays_the_pattern_or_says_why_not(
     assert message in capsys.readouterr().err
     with pytest.raises(ApcError, match=r"E897 --trace-of worst has no pattern: .* lan has jitter"):
         apc.simulate(system_of(topology(3, 300.0, more=", jitter: 1 ms")), trace_of="worst")
+
+
+LOOP = ROOT / "models" / "published" / "xiong-lam-2007" / "lossy-feedback.yaml"
+PROCESS, FORCE, GAIN = np.array([[0, 1], [0, -0.1]]), np.array([[0], [0.1]]), np.array([[3.75, 11.5]])
+# The period, and the numbers of the common quadratic function and of the small gain.
+LOOPS = [(0.8, 1, 0), (0.4, 3, 2), (0.2, 7, 5), (0.16, 9, 7)]
+
+
+def loop_losses(period: float) -> ConsecutiveLosses:
+    found = apc.mean_square_stability(LOOP, params={"tick.period": period})
+    assert found is not None and found.losses_in_a_row is not None
+    return found.losses_in_a_row
+
+
+def radii(products: np.ndarray) -> np.ndarray:
+    return abs(np.linalg.eigvals(products)).max(axis=-1)
+
+
+@pytest.mark.parametrize(("period", "certified"), [case[:2] for case in LOOPS])
+def test_a_common_function_certifies_more_losses_and_the_next_number_has_an_unstable_pattern(
+    period: float, certified: int
+) -> None:
+    """One channel: all sequences of eight frames, and all of four gaps, of the process stepped by hand."""
+    found = loop_losses(period)
+    assert (found.certified, found.certificate) == (certified, LossCertificate.COMMON_FUNCTION)
+    assert found.unstable_pattern is not None and longest(found.unstable_pattern) == certified + 1
+    free, push = held(PROCESS, FORCE, period)
+    # The states are x, x' and the held control.
+    steps = {
+        True: np.block([[free, push], [np.zeros((1, 2)), np.eye(1)]]),
+        False: np.block([[free - push @ GAIN, np.zeros((2, 1))], [-GAIN, np.zeros((1, 1))]]),
+    }
+
+    def product(pattern: tuple[bool, ...]) -> np.ndarray:
+        return np.linalg.multi_dot([np.eye(3), *(steps[lost] for lost in reversed(pattern)), np.eye(3)])
+
+    patterns = [
+        pattern
+        for frames_ in range(1, 9)
+        for pattern in itertools.product((False, True), repeat=frames_)
+        if not all(pattern) and longest(pattern) <= certified
+    ]
+    assert radii(np.array([product(pattern) for pattern in patterns])).max() < 1
+    gaps = np.array([product((True,) * lost + (False,)) for lost in range(certified + 1)])
+    products = gaps
+    for _ in range(3):
+        products = (gaps[:, None] @ products).reshape(-1, 3, 3)
+        assert radii(products).max() < 1
+    growth_ = radii(product(found.unstable_pattern)) ** (1 / len(found.unstable_pattern))
+    assert found.growth == pytest.approx(growth_, rel=1e-12) and found.growth > 1
+
+
+@pytest.mark.parametrize(("period", "certified"), [(period, small) for period, _, small in LOOPS])
+def test_without_cvxpy_the_small_gain_certifies_and_the_note_names_what_is_missing(
+    period: float, certified: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "cvxpy", None)
+    found = loop_losses(period)
+    assert found.certified == certified
+    assert found.certificate == (LossCertificate.SMALL_GAIN if certified else None)
+    assert "no common quadratic function was sought: cvxpy is not installed (pip install" in found.note
+
+
+def test_the_unstable_pattern_of_a_loop_is_simulated() -> None:
+    played = apc.simulate(LOOP, params={"body.v": 1.0}, duration="96 s", trace_of="worst", jit=False)
+    speed = abs(played["user[1].body.x"])
+    assert max(speed[-3:]) > 1e6

@@ -107,6 +107,17 @@ def largest_period(a: float, b: float, k1: float, k2: float) -> float:
     return last_stable(radius_at, 0.01, 5.0)
 
 
+def most_losses(T: float, a: float, b: float, k1: float, k2: float) -> int:
+    """Return the most consecutive losses whose repetition is stable: the control is held."""
+    process, force, gain = np.array([[0, 1], [0, -a]]), np.array([[0], [b]]), np.array([[k1, k2]])
+    losses = 0
+    while True:
+        free, push = held(process, force, (losses + 1) * T)
+        if radius(free - push @ gain) > 1:
+            return losses - 1
+        losses += 1
+
+
 # ---- words ----
 
 

@@ -30,7 +30,8 @@ REQUIRED = {"title", "cite", "source", "statement", "result", "kind", "where", "
 REQUIRED |= {"read", "apc", "tolerance", "reason"}
 OPTIONAL = {"formula", "values", "divided_by", "check", "extensions", "slow"}
 NAMES = {name: getattr(math, name) for name in ("pi", "sin", "sqrt")}
-NAMES |= {name: getattr(by_hand, name) for name in ("growth", "largest_period", "verdict")} | {"abs": abs}
+NAMES |= {name: getattr(by_hand, name) for name in ("growth", "largest_period", "most_losses", "verdict")}
+NAMES |= {"abs": abs}
 # What the words of verdicts come to, those of a motion among them.
 SENSE = {
     "stable": "stable",

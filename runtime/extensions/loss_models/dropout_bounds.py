@@ -16,12 +16,18 @@ from d to w of norm at most ‖T_L‖₂ = 1 / (2 sin(π/(4L + 2))) for every pa
     ‖d ← r‖∞ ‖|W|‖₂ < 2 sin(π/(4L + 2))
 
 The map d ← r is block-diagonal in the modes; its norm is the largest gain.
+
+With one lossy channel a second certificate is tried. From one reception to the next, over ℓ losses, the
+states change by M_ℓ = A_r A_l^ℓ, with the frame maps A_l of a loss and A_r of a reception. If one P ≻ 0
+satisfies M_ℓᵀ P M_ℓ ≺ P for ℓ = 0 … L, all patterns of at most L consecutive losses are stable (Xiong and
+Lam, Stabilization of linear systems over networks with bounded packet loss, Automatica 43, 2007).
 """
 
 from __future__ import annotations
 
 import itertools
 import math
+from bisect import bisect_left
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
@@ -32,16 +38,17 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import Link, Model
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
-from apc.extensions.loss_models.loss_patterns import refuse_unheld
+from apc.extensions.loss_models.loss_patterns import channels_of, refuse_unheld
 from apc.extensions.loss_models.periodic_delays import Packets
 from apc.extensions.loss_models.small_gain import Response, change_of_sent, ratios_of, used_rows, weight_of
 from apc.lifting.interval_arithmetic import MIDPOINT_RADIUS, UNIT_ROUNDOFF, error_radius, value_of
 from apc.lifting.numeric_model import NumericModel, numeric_model
 from apc.mean_square.class_moments import build_reception
-from apc.mean_square.loss_results import ConsecutiveLosses
+from apc.mean_square.loss_results import ConsecutiveLosses, LossCertificate
 from apc.spectrum.eigenpairs import largest_magnitudes
 from apc.spectrum.enclosure import enclose_eigenvalues
 from apc.spectrum.interconnection import feedback_of, interconnect, lay_out_loop
+from apc.spectrum.lyapunov_functions import balanced, has_common_function
 from apc.spectrum.modes import orthogonal_loops
 from apc.spectrum.relative_coordinates import relative
 from apc.support.not_supported import NotSupportedError
@@ -56,6 +63,10 @@ MANY = 1000
 
 # Fractions of the consecutive losses allowed by a gain that are tried if a proof fails for the full number.
 PARTS = (1.0, 0.9, 0.5, 0.1)
+
+# Consecutive losses and states for which a common quadratic function is sought: one semidefinite program then
+# takes at most some seconds.
+MOST_LOSSES, MOST_STATES = 40, 16
 
 # Loss patterns searched: all of this many frames; this many gaps of up to this many frames; one long gap
 # after a few short ones.
@@ -91,14 +102,24 @@ def worst_case(numeric: NumericModel) -> ConsecutiveLosses:
     except NotSupportedError as why:
         return ConsecutiveLosses(None, None, None, f"consecutive losses are undecided: {why}")
     certified = _harmless_losses(modes, weight)
+    certificate = LossCertificate.SMALL_GAIN if certified else None
     if certified == MANY:
-        return ConsecutiveLosses(
-            MANY, None, None, f"at least {MANY:,} consecutive losses are harmless; more were not analyzed"
-        )
+        note = f"at least {MANY:,} consecutive losses are harmless; more were not analyzed"
+        return ConsecutiveLosses(MANY, None, None, note, certificate)
     pattern, growth, note = _unstable_pattern(modes, certified or 0)
-    if certified is None and pattern is None:
-        note = f"stability without packet loss is not proved; {note}"
-    return ConsecutiveLosses(certified, pattern, growth, note)
+    if certified is None:
+        note = note if pattern else f"stability without packet loss is not proved; {note}"
+    elif _channels(numeric.model) == 1 and max(mode.lost.shape[-1] for mode in modes) <= MOST_STATES:
+        most = _longest_burst(pattern) - 1 if pattern else MOST_LOSSES
+        try:
+            quadratic = _common_function_losses(modes, certified, most)
+        except ApcError as missing:
+            absent = missing.mistakes[0]
+            note += f"; no common quadratic function was sought: {absent.message} ({absent.fix})"
+        else:
+            if quadratic > certified:
+                certified, certificate = quadratic, LossCertificate.COMMON_FUNCTION
+    return ConsecutiveLosses(certified, pattern, growth, note, certificate)
 
 
 def worst_trace(system: Model) -> Model:
@@ -210,6 +231,46 @@ def _harmless_losses(modes: Sequence[LossMode], weight: float) -> int | None:
         if all(mode.received.is_below(level) for mode in modes):
             return losses
     return 0
+
+
+def _channels(system: Model) -> int:
+    """Return the number of channels that lose packets."""
+    peers = sum(group.count for group in system.groups)
+    return sum(channels_of(link, peers) for link in system.links if link.channel is not None)
+
+
+def _longest_burst(pattern: Sequence[bool]) -> int:
+    """Return the largest number of consecutive losses of a pattern that ends with a reception."""
+    return max(len(list(run)) for lost, run in itertools.groupby(pattern) if lost)
+
+
+def _common_function_losses(modes: Sequence[LossMode], certified: int, most: int) -> int:
+    """Return the largest number of consecutive losses with a common quadratic function.
+
+    Parameters
+    ----------
+    modes
+        The modes of a model with one lossy channel.
+    certified, most
+        A number proved harmless, and the largest number that is tried.
+
+    Raises
+    ------
+    ApcError
+        E875 cvxpy is not installed.
+    """
+    untried = range(certified + 1, most + 1)
+    return certified + bisect_left(
+        untried, True, key=lambda losses: not all(_has_common_function(mode, losses) for mode in modes)
+    )
+
+
+def _has_common_function(mode: LossMode, losses: int) -> bool:
+    """Return whether a mode has a common quadratic function for up to a number of consecutive losses."""
+    gaps = [mode.received.a]
+    for _ in range(losses):
+        gaps.append(MIDPOINT_RADIUS.multiply(gaps[-1], mode.lost))
+    return not mode.lost.size or has_common_function(balanced(gaps))
 
 
 @cache
