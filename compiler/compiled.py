@@ -140,7 +140,8 @@ class Link:
     """A network link, which transfers the values sent by every peer to the receivers.
 
     `clock` is the name of a clock, `delay` of a timing; `delays` are the pairs of groups with other delays.
-    `channel` is None for a reliable link.
+    `channel` is None for a reliable link. `order` is "before" if a packet takes the values before the ticks
+    at its instant, "after" if it takes the values after them; such a packet is received at later ticks only.
     """
 
     name: str
@@ -149,6 +150,12 @@ class Link:
     graph: Graph
     delays: tuple[PairDelay, ...]
     channel: Channel | None = None
+    order: str = "before"
+
+    @property
+    def after(self) -> bool:
+        """Whether a packet takes the values after the ticks at its instant."""
+        return self.order == "after"
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,10 +13,10 @@ Event order. Periods, phases and delays are exact rationals of a second. At an i
 
 1. continuous variables are sampled: their value at t⁻, before steps 2 to 4;
 2. network clocks tick: each sender's packet contains the sample at t, and packets with an arrival time ≤ t
-are
-   delivered;
+   are delivered;
 3. force clocks tick: forces are computed from the samples at t and the newest delivered values;
-4. holds switch: a force computed at t acts from t + its delay (0 means t⁺) until the next force acts.
+4. holds switch: a force computed at t acts from t + its delay (0 means t⁺) until the next force acts;
+5. links with `order: after` send, instead of in step 2: no tick at t receives such a packet.
 
 For a link's delay T_d, a packet sent at t is available from t + T_d on, including a tick at exactly t + T_d.
 Before the first packet arrives, a receiver uses the sender's start values; before the first force acts, the

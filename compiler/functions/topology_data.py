@@ -154,7 +154,7 @@ def used_links(topology: Topology, peer_types: Sequence[PeerType], timings: Timi
                 channel_declaration.on_loss,
                 channel_declaration.trace,
             )
-        links.append(Link(link.name, link.clock, delay, link.graph, delays, channel))
+        links.append(Link(link.name, link.clock, delay, link.graph, delays, channel, link.order))
     return tuple(links)
 
 

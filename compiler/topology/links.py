@@ -40,7 +40,14 @@ from apc.compiler.topology.graphs import COMPLETE, DelayDeclaration, read_delays
 from apc.compiler.topology.instances import PartInstance
 from apc.compiler.topology.topology_parameters import NamedNumbers
 
-EFFECTIVE = ("delay", "jitter", "distribution", "reorder", "on_loss")  # the numbers and options of a link
+EFFECTIVE = (
+    "delay",
+    "order",
+    "jitter",
+    "distribution",
+    "reorder",
+    "on_loss",
+)  # the numbers and options of a link
 # The probabilities of netem's loss model, in netem's order.
 PROBABILITIES = {
     "p": "probability that a good link turns bad after a packet",
@@ -123,8 +130,8 @@ class ChannelDeclaration:
 class LinkDeclaration:
     """A link: communication graph, delay, and `channel` (None for a reliable link).
 
-    `within` has the ends of a range of delays in seconds, with its middle as `delay`; None for a single
-    delay.
+    `order` states whether a packet takes the values "before" or "after" the ticks at its instant. `within`
+    has the ends of a range of delays in seconds, with its middle as `delay`; None for a single delay.
     """
 
     name: str
@@ -134,6 +141,7 @@ class LinkDeclaration:
     graph: Graph
     delays: tuple[DelayDeclaration, ...]
     channel: ChannelDeclaration | None
+    order: str
     location: SourceLocation
 
 
@@ -231,7 +239,8 @@ def read_link(part: PartInstance, entry: PartEntry, numbers: NamedNumbers) -> Li
         delay = ScalarValue((delay_range[0] + delay_range[1]) / 2, ends[0].dimension, None, node.location)
     if clock is None or delay is None:
         raise AlreadyReportedError
-    return LinkDeclaration(part.name, clock, delay, delay_range, graph, delays, channel, part.location)
+    order = dict(part.options).get("order", "before")
+    return LinkDeclaration(part.name, clock, delay, delay_range, graph, delays, channel, order, part.location)
 
 
 def _read_channel(

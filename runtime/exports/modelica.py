@@ -484,6 +484,10 @@ def _refuse_unsupported(system: Model, exchange: CommunicationGraph) -> None:
     for link, law in unreliable(system):
         message = f"{chance(link, law)}: random packet loss or delay"
         raise _refused(system, message, "use a reliable link, or apc simulate")
+    for link in system.links:
+        if link.after:
+            message = f"packets of {link.name} that take the values after the ticks (order: after)"
+            raise _refused(system, message, "use order: before, or apc simulate")
     for peer_type in system.peer_types:
         for function, _, message, _ in [
             (peer_type.derivative, "", "what moves", ""),

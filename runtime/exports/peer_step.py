@@ -312,7 +312,14 @@ def refused(system: Model, message: str, fix: str = "", code: str = "E960", *, a
 
 
 def _refuse_iterations(system: Model, name: str, peer_type: PeerType) -> None:
-    """Raise ApcError E960 for a peer with equations solved by Newton's method, or without ticks."""
+    """Raise ApcError E960 for a peer with equations solved by Newton's method, or without ticks.
+
+    A peer that sends after its ticks is refused, too.
+    """
+    if after := [link.name for link in system.links if link.after]:
+        message = f"packets of {after[0]} take the values after the ticks (order: after)"
+        advice = "use order: before, or apc run"
+        raise refused(system, f"{message}, which is not exported to C", advice=advice)
     for function, when, message, where in instant_functions(peer_type):
         if not function.is_a("SXFunction"):
             message = f"{name}: {when}{message}{where} need an iteration, which is not exported to C"

@@ -160,7 +160,8 @@ def _ages_of_ticks(
             waited = (time - delay_by_link[link] - phase[clock]) % period[
                 clock
             ]  # since the newest available packet
-            if not waited and rank("tick") < rank("deliver"):
+            is_after = exchange.links[link].after and delay_by_link[link] == 0
+            if not waited and (is_after or rank("tick") < rank("deliver")):
                 waited = period[clock]
             ages.append((link, delay_by_link[link] + waited + missed))
         result.append(tuple(ages))

@@ -536,7 +536,14 @@ def stored_of(
         law = PERFECT if perfect or link.channel is None else channel_law(system, link, delay)
         error_bound = lost.get(route[0], (0.0,))
         memory = memory_of(
-            law, delay, sent, ticks, reception.frame, strictly=reception.strictly, lost=error_bound
+            law,
+            delay,
+            sent,
+            ticks,
+            reception.frame,
+            strictly=reception.strictly,
+            after=link.after,
+            lost=error_bound,
         )
         memories.append(route_memory(route, memory, sorted({row.channel for row in selected})))
     return memories

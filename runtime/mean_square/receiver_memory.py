@@ -147,6 +147,7 @@ def memory_of(
     frame: Fraction,
     *,
     strictly: bool = False,
+    after: bool = False,
     lost: tuple[float, ...] = (0.0,),
 ) -> ReceiverMemory:
     """Return the receiver memory for one sender.
@@ -161,6 +162,8 @@ def memory_of(
         The length of a frame, in seconds.
     strictly
         Whether a tick misses a simultaneous arrival.
+    after
+        Whether a packet is sent after the ticks at its instant, which miss it.
     lost
         The error bound of the loss probability; over a cell of parameters, then its changes from the center
         to the upper side of each.
@@ -178,7 +181,8 @@ def memory_of(
             for start in starts:
                 elapsed = time - start + frames_back * length
                 if elapsed not in chance:
-                    chance[elapsed] = arrives(law, delay, Fraction(elapsed, unit), strictly=strictly)
+                    arrived = arrives(law, delay, Fraction(elapsed, unit), strictly=strictly)
+                    chance[elapsed] = 0.0 if after and not elapsed else arrived
                 values.append(chance[elapsed])
         return tuple(values)
 

@@ -88,7 +88,7 @@ class ArrivalProcess:
 
     `law` is the channel law common to all directed links except for their `delays` (M,) in seconds; `nominal`
     (M,) are these delays in quanta. Packet k is sent at phase + k*period, tick k is at tick_phase +
-    k*tick_period. `newest` as in `LinkReceiver`.
+    k*tick_period. `newest` and `least` as in `LinkReceiver`.
     """
 
     law: ChannelLaw
@@ -100,6 +100,7 @@ class ArrivalProcess:
     tick_period: int
     quantum: Fraction
     newest: bool
+    least: int
 
     def stored(self, route: Route) -> int:
         """Return an upper bound of the number of packets stored for each directed link."""
@@ -145,17 +146,21 @@ def arrival_process_of(
         for clock in system.clocks
     }
     groups, group_pair_of = _group_pairs(exchange, route.pairs)
+    least = int(link.after)
     group_delays = [timings[exchange.delay(link.name, *pair)] for pair in groups]
     arrival_process = ArrivalProcess(
         law=channel_law(system, link, timings[link.delay]),
         delays=np.array([float(number) for number in group_delays])[group_pair_of],
-        nominal=np.array([int(number / quantum) for number in group_delays], np.int64)[group_pair_of],
+        nominal=np.array([max(int(number / quantum), least) for number in group_delays], np.int64)[
+            group_pair_of
+        ],
         phase=int(grids[link.clock][0]),
         period=int(grids[link.clock][1]),
         tick_phase=int(grids[route.clock][0]),
         tick_period=int(grids[route.clock][1]),
         quantum=quantum,
         newest=link.channel.reorder == "newest",
+        least=least,
     )
     _check_arrival_process(system, route, arrival_process)
     return arrival_process
@@ -193,7 +198,15 @@ class LinkReceiver:
     """The packets in effect on a set of directed links at successive ticks, in the order of time."""
 
     def __init__(
-        self, source: PacketSource, *, phase: int, period: int, delay: int, quantum: Fraction, newest: bool
+        self,
+        source: PacketSource,
+        *,
+        phase: int,
+        period: int,
+        delay: int,
+        quantum: Fraction,
+        newest: bool,
+        least: int = 0,
     ) -> None:
         """Start before the first packet.
 
@@ -210,13 +223,16 @@ class LinkReceiver:
         newest
             Whether the most recently sent packet is in effect; otherwise the most recently arrived packet (of
             simultaneous arrivals, the packet sent last).
+        least
+            The least number of quanta from sending to reception: 1 if a packet is sent after the ticks at its
+            instant.
         """
         self.source = source
         self.phase = phase
         self.period = period
         self.delay = delay
         self.quantum = float(quantum)
-        self.newest = newest
+        self.newest, self.least = newest, least
         self._effective = np.full(source.arcs, START, np.int64)
         # The newest lost packets whose nominal arrival is past.
         self._gap = np.full(source.arcs, START, np.int64)
@@ -261,7 +277,9 @@ class LinkReceiver:
         arcs, numbers = np.indices(delays.shape)
         numbers += first_number
         # The delay rounded up to quanta, and by how much.
-        reception_times = self.phase + self.period * numbers - (-delay_parts // FINENESS)
+        reception_times = (
+            self.phase + self.period * numbers + np.maximum(-(-delay_parts // FINENESS), self.least)
+        )
         part_before = -delay_parts % FINENESS
         sent = np.stack([arcs, numbers, reception_times, part_before])
         self._due = np.concatenate([self._due, sent[:2, lost]], axis=1)
@@ -357,6 +375,7 @@ def _link_receivers(
             delay=nominal,
             quantum=arrival_process.quantum,
             newest=arrival_process.newest,
+            least=arrival_process.least,
         )
         pairs.append((arcs, receiver))
     return pairs

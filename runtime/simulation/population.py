@@ -25,7 +25,7 @@ from apc.network.packet_schedule import START, DeliveredPackets, Route
 from apc.simulation.exchange_program import ExchangeProgram, exchange_program_of
 from apc.simulation.program import GroupProgram, timed_events
 from apc.timing.communication_graph import CommunicationGraph
-from apc.timing.schedule import Propagate, Schedule, Tick
+from apc.timing.schedule import Propagate, Schedule, SendEvent, Tick
 
 Floats = NDArray[np.float64]
 
@@ -145,18 +145,19 @@ def exchanges_within(schedules: Sequence[Schedule]) -> tuple[int, ...]:
     slots = {received.sent for schedule in schedules for received in schedule.received if received.lag == 0}
     # Over an unreliable link a packet may be received as soon as it is sent.
     any_time = {selected.coupling_term.link for schedule in schedules for selected in schedule.selected}
-    instants = {
-        instant
-        for schedule in schedules
-        for sent, instant in zip(schedule.sent, schedule.sent_times, strict=True)
-        if sent in slots or sent.link in any_time
-    }
+    instants = set()
     for schedule in schedules:
         for now, event in timed_events(schedule):
-            received = (row for rows in event.input_rows for row in rows) if isinstance(event, Tick) else ()
-            if any(schedule.all_received[row].coupling_term.edge for row in received):
-                instants.add(now)
-    return tuple(sorted(instants))
+            match event:
+                case SendEvent(_, rows, after):
+                    sent = [schedule.sent[row] for _, row in rows]
+                    if any(item in slots or item.link in any_time for item in sent):
+                        instants.add(now + after)  # all events of the instant precede
+                case Tick(_, _, input_rows):
+                    received = (schedule.all_received[row] for rows in input_rows for row in rows)
+                    if any(item.coupling_term.edge for item in received):
+                        instants.add(now)
+    return tuple(sorted(instants - {schedules[0].frame}))
 
 
 def instants_within(schedules: Sequence[Schedule]) -> tuple[int, ...]:

@@ -78,9 +78,12 @@ def build_program(
 
 def _split_events(events: Timed, cuts: Sequence[int]) -> list[Timed]:
     """Return the events of each segment of the frame."""
-    # The sends of an instant precede its other events in every group.
+    # The sends of an instant precede its other events in every group, except those after its ticks.
     ends = [
-        sum(now < cut or (now == cut and isinstance(event, SendEvent)) for now, event in events)
+        sum(
+            now < cut or (now == cut and isinstance(event, SendEvent) and not event.after)
+            for now, event in events
+        )
         for cut in sorted(cuts)
     ]
     return [events[begin:end] for begin, end in zip([0, *ends], [*ends, len(events)], strict=True)]
@@ -262,7 +265,7 @@ class _SegmentWriter:
                 u = casadi.vertsplit(self.u)
                 u[hold] = self.values[value]
                 self.u = _column(self.type_, u)
-            case SendEvent(partition, rows):
+            case SendEvent(partition, rows, _):
                 channels = self._evaluate(self.peer_type.sends[partition].send, now)
                 self.sent |= {row: channels[channel] for channel, row in rows}
             case Tick(partition, index, received):

@@ -110,10 +110,14 @@ class Propagate:
 
 @dataclass(frozen=True, slots=True)
 class SendEvent:
-    """Send partition `partition` of the subsystem sends; `rows` are (channel, row of s) pairs."""
+    """Send partition `partition` of the subsystem sends; `rows` are (channel, row of s) pairs.
+
+    With `after`, the values are those after the other events at the instant.
+    """
 
     partition: int
     rows: tuple[tuple[int, int], ...]
+    after: bool = False
 
 
 @dataclass(frozen=True, slots=True)

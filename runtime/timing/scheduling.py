@@ -10,7 +10,7 @@ Does not: use parameters other than times.
 from __future__ import annotations
 
 import functools
-from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 
@@ -302,7 +302,8 @@ def newest(
     """
     delay, grid = times.delays[coupling_term.delay], times.clocks[link.clock]
     missed = 1 if delay == 0 and rank["deliver"] < rank["send"] else 0
-    number = grid.newest(instant - delay, strictly=rank["tick"] < rank["deliver"]) - missed
+    strictly = rank["tick"] < rank["deliver"] or (link.after and delay == 0)
+    number = grid.newest(instant - delay, strictly=strictly) - missed
     frames, slot = divmod(number, times.frame // grid.period)  # a negative number belongs to an earlier frame
     return ReceivedSample(coupling_term, SentSample(coupling_term.link, channel, slot), -frames)
 
@@ -331,6 +332,7 @@ def _build_schedule(
     """
     peer_type = pattern.peer_type
     grid_of = {link.name: times.clocks.get(link.clock) for link in system.links}
+    after = {link.name for link in system.links if link.after}
     receptions = {item for row in received_at.values() for receive in row for item in receive}
     received = tuple(sorted(received for received in receptions if isinstance(received, ReceivedSample)))
     selected = tuple(sorted(selected for selected in receptions if isinstance(selected, UncertainSample)))
@@ -341,7 +343,7 @@ def _build_schedule(
     events = _sorted_events(
         [
             *_tick_events(pattern, received_at, received + selected, times, rank["tick"]),
-            *_send_events(pattern, grid_of, sent, times.frame, rank["send"]),
+            *_send_events(pattern, grid_of, sent, times.frame, rank["send"], after),
             *switches,
             *((mark, 0, None) for mark in sample_times),  # so that propagation stops there
         ]
@@ -422,6 +424,7 @@ def _send_events(
     sent: Sequence[SentSample],
     frame: int,
     rank: int,
+    after: Collection[str],
 ) -> Iterator[_TimedEvent]:
     """Yield the send events of a peer in a frame, those without a packet to be received left out.
 
@@ -433,6 +436,8 @@ def _send_events(
         The samples that the peer sends and other peers receive, in the order of the rows of s.
     frame, rank
         The length of the frame in quanta, and the rank of send events among coincident events.
+    after
+        The links whose packets take the values after all other events at an instant.
     """
     for send_index, sending in enumerate(pattern.peer_type.sends):
         grid = grid_of[sending.link]
@@ -444,7 +449,9 @@ def _send_events(
             )
             if rows:
                 assert grid is not None
-                yield grid.at(slot), rank, SendEvent(send_index, rows)
+                is_after = sending.link in after
+                rank_of_link = len(ORDER) if is_after else rank
+                yield grid.at(slot), rank_of_link, SendEvent(send_index, rows, is_after)
 
 
 def _hold_updates(

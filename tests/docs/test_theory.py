@@ -161,11 +161,33 @@ def relative(matrices: list[Matrix], rigid: Matrix) -> list[Matrix]:
 # ---- one claim a page ----
 
 
+def relayed(delay: float) -> float:
+    """Return the spectral radius of x″ = 126.7 u, u = −50 x − 11.8 x′ of samples every 1 ms, late by a delay.
+
+    The states are x, x′ and the controls of the last two samples.
+    """
+    rates = np.zeros((3, 3))
+    rates[0, 1], rates[1, 2] = 1.0, 126.7
+    late = round(delay // PERIOD)
+    old, new = expm(rates * (delay - late * PERIOD)), expm(rates * (PERIOD - delay + late * PERIOD))
+    gain = np.array([-50, -11.8])
+    step = np.zeros((4, 4))
+    for column, (x, v, last, before) in enumerate(np.eye(4)):
+        present = float(gain @ [x, v])
+        acting = [present, last, before][late : late + 2][::-1]
+        moved = new @ [*(old @ [x, v, acting[0]])[:2], acting[1]]
+        step[:, column] = *moved[:2], present, last
+    return float(abs(np.linalg.eigvals(step)).max())
+
+
 def test_time_semantics() -> None:
     """Packets of 8 ms act at the first tick; the hyperperiod is that of two rationals."""
     for name, late in (("delay 8 ms", 8), ("delay 8.5 ms", 9), ("delay 9 ms", 9)):
         (radius,) = line("time-semantics", f"{name}: ")
         assert magnitudes(users(complete(3), 1000.0, 500.0, late=late))[1] == pytest.approx(radius, abs=1e-9)
+    for name, delay in (("order after", 0.2e-3), ("order before", 1.2e-3)):
+        (radius,) = line("time-semantics", f"{name}: ")
+        assert relayed(delay) == pytest.approx(radius, abs=1e-9)
     (frame,) = line("time-semantics", "frame of 1 ms and 1/90 s: ")
     assert Fraction(frame).limit_denominator(1000) == Fraction(math.lcm(1, 1), math.gcd(1000, 90))
 

@@ -170,6 +170,8 @@ def _arrival_time(system: Model, lossy: Sequence[tuple[Link, ChannelLaw]]) -> Fr
     if len(system.links) > 1 or system.links[0].delays:
         raise NotSupportedError("substituted values together with packets of another link or delay")
     link = lossy[0][0]
+    if link.after:
+        raise NotSupportedError(f"substituted values for packets after the ticks ({link.name}: order: after)")
     period, phase = timings[clocks[link.clock].period], timings[clocks[link.clock].phase]
     frame = common_multiple([timings[clock.period] for clock in system.clocks])
     if frame != period:

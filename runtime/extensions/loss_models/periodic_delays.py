@@ -115,6 +115,7 @@ class Packets:
                     packet_delay is None
                     or sent_at + packet_delay > tick
                     or (sent_at + packet_delay == tick and reception.strictly)
+                    or (sent_at == tick and link.after)
                 ):
                     continue
                 best = max(best or (sent_at + packet_delay, number), (sent_at + packet_delay, number))

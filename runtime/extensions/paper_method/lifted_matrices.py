@@ -575,6 +575,8 @@ def _periods(system: Model, subsystems: Sequence[PeerClass]) -> tuple[Fraction, 
         for group in {subsystem.index: subsystem for subsystem in subsystems}.values()
         for text in _form_differences(group)
     ]
+    if any(link.after for link in system.links):
+        missing.append("packets that take the values before the ticks (order: before)")
     for subject, result in (("clock of forces", forces), ("network clock", networks)):
         if len(result) != 1:
             listed = f"got {' and '.join(result) or 'none'}"
