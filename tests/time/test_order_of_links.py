@@ -81,6 +81,17 @@ def test_a_relay_has_the_delay_of_its_packets_alone(relay: Relay, keys: str, del
     assert played.values[-1, names.index("user[1].roller.x")] == pytest.approx(state[0], rel=1e-9)
 
 
+@pytest.mark.parametrize("delay", [0.05, 0.37, 0.999])
+def test_an_actuator_that_ticks_at_arrivals_applies_each_packet_when_it_arrives(delay: float) -> None:
+    path = PUBLISHED.with_name("one-clock.yaml")
+    late = {"late": f"{delay} ms"}
+    assert apc.analyze(path, params=late).spectral_radius == pytest.approx(growth(delay * MS), rel=1e-12)
+    played = apc.simulate(path, duration="30 ms", params=late | {"roller.v": 1.0}, jit=False)
+    names = [signal.name for signal in played.signals]
+    state = np.linalg.matrix_power(step(delay * MS), 30) @ [0.0, 1.0, 0.0]
+    assert played.values[-1, names.index("user[1].roller.x")] == pytest.approx(state[0], rel=1e-9)
+
+
 def test_losses_of_packets_after_the_ticks_are_those_by_hand(relay: Relay) -> None:
     lost = step(MS)
     lost[2] = [0, 0, 1]
