@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
@@ -26,8 +27,11 @@ def topology(graph: str = "{arcs: [[1, 1]]}", loss: str = "", count: int = 1) ->
     )
 
 
-def frame() -> NDArray[np.float64]:
-    """Return the map of (x, v, packet) over 8 ms: F = K (x(t_k - 8 ms) - x) at each millisecond."""
+def frame(stiffness: float = STIFFNESS, *, lost: bool = False) -> NDArray[np.float64]:
+    """Return the map of (x, v, packet) over 8 ms: F = K (x(t_k - 8 ms) - x) at each millisecond.
+
+    A lost packet is replaced by the one before.
+    """
     rate = DAMPING / MASS
     decay = math.exp(-rate * 1e-3)
     reach = (1 - decay) / rate
@@ -37,8 +41,8 @@ def frame() -> NDArray[np.float64]:
     for x, v, packet in np.eye(3):
         state = np.array([x, v])
         for _ in range(8):
-            state = step @ state + push * STIFFNESS * (packet - state[0])
-        columns.append([*state, x])
+            state = step @ state + push * stiffness * (packet - state[0])
+        columns.append([*state, packet if lost else x])
     return np.array(columns).T
 
 
@@ -59,6 +63,25 @@ def test_a_simulation_is_the_same() -> None:
 def test_its_losses_are_not_judged() -> None:
     found = apc.mean_square_stability(compiled(topology(loss=", loss: 20 %")))
     assert found.stable is None and "a peer sends to itself" in str(found)
+
+
+def test_its_losses_in_a_row_are_those_by_hand() -> None:
+    """All patterns of twelve frames, without the free translation."""
+    found = apc.mean_square_stability(compiled(topology(loss=", loss: 20 %")), params={"pull.stiffness": 600})
+    assert found is not None and (losses := found.losses_in_a_row) is not None
+    assert losses.certified == 2 and losses.unstable_pattern == (True, True, True, False)
+
+    def growth(pattern: tuple[bool, ...]) -> float:
+        """Return the growth per frame of (v, packet - x)."""
+        change = np.array([[1.0, 0, 0], [0, 1, 0], [1, 0, 1]])  # of (x, v, packet - x) to (x, v, packet)
+        steps = [np.linalg.inv(change) @ frame(600.0, lost=lost) @ change for lost in reversed(pattern)]
+        product = np.linalg.multi_dot([*steps, np.eye(3)])[1:, 1:]
+        return float(max(abs(np.linalg.eigvals(product))) ** (1 / len(pattern)))
+
+    assert losses.growth == pytest.approx(growth(losses.unstable_pattern), rel=1e-10)
+    for pattern in itertools.product((False, True), repeat=12):
+        if "111" not in "".join(str(int(lost)) for lost in pattern * 2):
+            assert growth(pattern) < 1
 
 
 @pytest.mark.parametrize("graph", ["{edges: [[1, 1]]}", "complete", "{arcs: [[1, 2]]}"])
