@@ -65,6 +65,7 @@ def test_its_losses_are_not_judged() -> None:
     assert found.stable is None and "a peer sends to itself" in str(found)
 
 
+@pytest.mark.needs_extension("loss_models")
 def test_its_losses_in_a_row_are_those_by_hand() -> None:
     """All patterns of twelve frames, without the free translation."""
     found = apc.mean_square_stability(compiled(topology(loss=", loss: 20 %")), params={"pull.stiffness": 600})
