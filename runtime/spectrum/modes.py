@@ -393,7 +393,7 @@ def couple(
                         weight /= degrees[coupling_term.link, g]
                     elif coupling_term.operator in ("max", "min"):  # the one that is split off counts once
                         weight = Fraction(1 if weight > 0 else -1)
-                    row.append(weight * group.gain(coupling_term, sender))
+                    row.append(weight * group.gain(coupling_term, sender) if coupling_term.edge else weight)
                 else:
                     row.append(Fraction(0))
             rows.append(tuple(row))

@@ -31,11 +31,15 @@ def null_space(matrix: Matrix) -> list[list[Fraction]]:
     ordered by this index. Elimination is modulo a prime, and its vectors are verified; exact elimination,
     whose rationals grow, is for matrices whose null space has no simple fractions.
     """
-    nonzero = [(i, j, Fraction(matrix[i, j])) for i, j in np.argwhere(matrix != 0).tolist()]
+    nonzero = [(i, j, matrix[i, j]) for i, j in np.argwhere(matrix != 0).tolist()]
     residues = np.zeros(matrix.shape, dtype=object)
+    known: dict[tuple[int, int], Any] = {}
     try:
         for i, j, entry in nonzero:
-            residues[i, j] = residue(entry)
+            key = entry.numerator, entry.denominator
+            if key not in known:
+                known[key] = residue(entry)
+            residues[i, j] = known[key]
         vectors = null_space_modulo(residues)
         if _solve(nonzero, vectors):
             return vectors
@@ -48,13 +52,14 @@ def null_space(matrix: Matrix) -> list[list[Fraction]]:
     return _null_space_basis(exact, lambda item: Fraction(int(item.p), int(item.q)))
 
 
-def _solve(nonzero: Sequence[tuple[int, int, Fraction]], vectors: Sequence[Sequence[Fraction]]) -> bool:
+def _solve(nonzero: Sequence[tuple[int, int, Fraction | int]], vectors: Sequence[Sequence[Fraction]]) -> bool:
     """Return whether vectors solve homogeneous equations with these entries (row, column, value)."""
     for vector in vectors:
-        sums: dict[int, Fraction] = {}
+        sums: dict[int, Fraction | int] = {}
         for i, j, entry in nonzero:
             if vector[j]:
-                sums[i] = sums.get(i, Fraction(0)) + entry * vector[j]
+                product = entry if vector[j] == 1 else entry * vector[j]
+                sums[i] = sums[i] + product if i in sums else product
         if any(sums.values()):
             return False
     return True

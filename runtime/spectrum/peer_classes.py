@@ -394,10 +394,11 @@ def has_more_states(numeric: NumericModel, states: int) -> bool:
     return len(_classes(numeric, by_matrices=True)) > max(1, states // max(sizes))
 
 
-def representatives(numeric: NumericModel) -> list[PeerClass]:
+@cached_in_model
+def representatives(numeric: NumericModel) -> tuple[PeerClass, ...]:
     """Return a class for each group of the model, with the parameters of its first peer, not lifted."""
     runs = itertools.pairwise(numeric.exchange.starts.tolist())
-    return [
+    return tuple(
         build_group(numeric, index, PeerIndices((range(*run),)), lifted=False)
         for index, run in enumerate(runs)
-    ]
+    )

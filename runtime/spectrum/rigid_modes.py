@@ -303,7 +303,11 @@ def _constant_solution_equations(
                     for h, weight in enumerate(system.coupling[coupling_term][g]):
                         if weight:
                             for column, entry in sent[h].get((coupling_term.link, channel), ()):
-                                received[column] = received.get(column, 0) + weight * entry
+                                # A sum of hundreds of senders consists of weights of single packets.
+                                product = weight if entry == 1 else weight * entry
+                                received[column] = (
+                                    received[column] + product if column in received else product
+                                )
                 for reader in readers:
                     for column, entry in received.items():
                         rows[reader, column] += tick.r[reader, index] * entry
