@@ -22,9 +22,10 @@ or ρ(M)² if that eigenvalue is below 1 for all such μ.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -45,7 +46,6 @@ from apc.spectrum.eigenpairs import largest_magnitudes
 from apc.spectrum.enclosure import enclose_eigenvalues
 from apc.spectrum.kyp_bounds import is_positive
 from apc.spectrum.matrix_norms import balance
-from apc.support.threads import load_pool
 
 Floats = NDArray[np.float64]
 Matrix = NDArray[Any]
@@ -60,6 +60,10 @@ DOUBLINGS, ENDLESS = 60, 1e100
 # distance is multiplied by this factor until its largest eigenvalue is below 1. The last constant is the
 # tolerance for no growth.
 NEAR, WIDER, NOTHING = 1e-9, 4.0, 1e-9
+
+# The inverse of the gain where it has no bound; the limits of the steps to its root, in number, far above
+# those needed, and in length.
+TINY, MOST_STEPS, FARTHEST = 1e-300, 100, 40.0
 
 # The relative step of central differences: their truncation is below 1e-7, their rounding below 1e-8.
 DIFFERENCE = 1e-4
@@ -393,17 +397,33 @@ def _deviation(operator: Operator, growth: float) -> float:
 def _growth_by_noise(operator: Operator) -> float | None:
     """Return the μ above the growth factor of means where the gain's largest eigenvalue ρ is 1.
 
-    The result is None if ρ is below 1 for all such μ. The growth is computed as the root of 1/ρ − 1, which is
-    nearly a straight line from −1 at the growth factor of the means, where the gain has its pole.
+    The result is None if ρ is below 1 for all such μ. With the distance d = μ − m from the growth factor of
+    the means, where the gain has its pole, log ρ is nearly a straight line over log d: the secant method
+    needs some five gains.
     """
     least = max(operator.means, NOTHING)
-    deviation = partial(_deviation, operator)
-    low, gap = least * (1 + NEAR), max(1 - least, 0.1 * least)
-    if deviation(low) > 0:
+
+    def log_gain(place: float) -> float:
+        """Return log ρ at a distance e^place from the growth factor of the means."""
+        return -math.log(max(1 + _deviation(operator, least + math.exp(place)), TINY))
+
+    place = math.log(NEAR * least)
+    value, growth = log_gain(place), least
+    if value <= 0:
         return None
-    while deviation(high := least + gap) < 0:
-        low, gap = high, WIDER * gap
-    return float(load_pool("scipy.optimize").brentq(deviation, low, high, xtol=1e-300, rtol=CLOSE))
+    low, high, next_place = place, math.inf, place + value
+    for _ in range(MOST_STEPS):
+        before, value_before, place = place, value, next_place
+        value = log_gain(place)
+        low, high = (max(low, place), high) if value > 0 else (low, min(high, place))
+        slope = (value - value_before) / (place - before)
+        next_place = place - value / slope if slope else place
+        if not low < next_place < min(high, place + FARTHEST):
+            next_place = (low + high) / 2 if math.isfinite(high) else low + math.log(WIDER)
+        growth = least + math.exp(next_place)
+        if abs(growth - least - math.exp(place)) <= CLOSE * growth or high - low <= CLOSE:
+            break
+    return growth
 
 
 def _is_below(operator: Operator, growth: float) -> bool | None:
