@@ -64,9 +64,9 @@ Floats = NDArray[np.float64]
 
 LOCATION = SourceLocation("margins")
 
-# Units of a stiffness and of a damping, along an axis or about one, as components write them.
+# Units of a stiffness and of a damping, along an axis or about one, and of the contact of Hunt and Crossley.
 STIFFNESSES = ("N/m", "kg/s^2")
-UNITS = (*STIFFNESSES, "N*s/m", "kg/s", "N*m/rad", "N*m*s/rad")
+UNITS = (*STIFFNESSES, "N*s/m", "kg/s", "N*m/rad", "N*m*s/rad", "kg/(m^(1/2)*s^2)", "kg/(m^(3/2)*s)")
 
 # The end of the search, as a multiple of the present value (for 0, of the change that would move an
 # eigenvalue by 1).

@@ -237,6 +237,16 @@ def test_a_region_at_the_equilibrium_has_the_boundary_of_the_local_stiffness() -
         assert region.contains(0.98 * value, damping) and not region.contains(1.02 * value, damping)
 
 
+def test_the_stiffness_of_a_hertz_contact_has_a_margin() -> None:
+    """At a fixed depth d the slope 1.5 K d^0.5 reaches the critical stiffness of the linear spring."""
+    point = apc.operating_point(compiled(PRESSED))
+    model, depth = point.model, -positions(point)["device.x"]
+    (row,) = (row for row in apc.margins(model).rows if row.parameter == "contact.stiffness")
+    linear = apc.critical(compiled(SPRING), "contact.stiffness").value
+    assert linear is not None and row.value is not None and row.error is not None
+    assert 1.5 * row.value * depth**0.5 == pytest.approx(linear, rel=1e-6)
+
+
 def test_delays_are_varied_at_one_equilibrium() -> None:
     found = apc.critical(compiled(PRESSED), "contact.delay", operating_point="equilibrium")
     linear = apc.critical(compiled(SPRING), "contact.delay", params={"contact.stiffness": hertz()})
