@@ -3,8 +3,8 @@
 Takes: nothing (data types, created by the stage `functions` and read by the runtime).
 Gives: `Model` and its parts: `Clock`, `Graph`, `PairDelay`, `Loss`, `Channel`, `Link`; `Formula`, `Timing`,
 `Parameter`; `State`, `Hold`, `Receive`, `ClockPartition`, `SendPartition`, `ForcePorts`, `Limit`, `Replaced`,
-`PeerType`; `PeerColumn`, `Group`; `Experiment`, `Axis`. The names of counted parameters: `PEERS`, `count_of`,
-`group_count`, `counts_peers`. Those of an equilibrium: `rest_of`, `start_of`. `LENGTH`, `ANGLES`.
+`PeerType`; `PeerColumn`, `Group`; `PeerTime`, `Experiment`, `Axis`. The names of counted parameters: `PEERS`,
+`count_of`, `group_count`, `counts_peers`. Those of an equilibrium: `rest_of`, `start_of`. `LENGTH`, `ANGLES`.
 Guarantees: plain frozen data; numbers in SI; periods, phases and delays exact rationals of a second.
 Does not: evaluate anything, or read or write files (see `store`).
 
@@ -331,10 +331,11 @@ class PeerType:
     A float value of a parameter is exact, except for the sum of weights that a peer receives over a link with
     arcs: different sums have different floats. `hands` are the parts in the section `hands`
     whose force depends on their motion; `held` are the parts that a hand is connected to, or without hands
-    the parts with a connector for hands. `linear` is the peer type in a linear analysis, with the same states
-    and parameters, None if it is the same; `replaced` are the parts with other equations there. `symbols` are
-    the symbols of published wall conditions with their parameters or numbers, empty unless every part except
-    hands has symbols.
+    the parts with a connector for hands. `joining` are the parts whose values at a joining peer are the mean
+    of the other peers': shared objects, and the parts that send. `linear` is the peer type in a linear
+    analysis, with the same states and parameters, None if it is the same; `replaced` are the parts with other
+    equations there. `symbols` are the symbols of published wall conditions with their parameters or numbers,
+    empty unless every part except hands has symbols.
     """
 
     name: str
@@ -351,6 +352,7 @@ class PeerType:
     linear: PeerType | None = None
     replaced: tuple[Replaced, ...] = ()
     symbols: tuple[tuple[str, str], ...] = ()
+    joining: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -379,11 +381,29 @@ class Group:
 
 
 @dataclass(frozen=True, slots=True)
+class PeerTime:
+    """The instant `at` in seconds at which a peer such as "user[4]" joins or leaves.
+
+    `line` and `column` are its location in the topology, 0 for an option.
+    """
+
+    peer: str
+    at: Fraction
+    line: int = 0
+    column: int = 0
+
+
+@dataclass(frozen=True, slots=True)
 class Experiment:
-    """The duration of a simulation in seconds (None if not given), and the seed of its random numbers."""
+    """The duration of a simulation in seconds (None if not given), and the seed of its random numbers.
+
+    `joins` and `leaves` are the peers that join after the start and leave before the end.
+    """
 
     duration: Fraction | None = None
     seed: int = 0
+    joins: tuple[PeerTime, ...] = ()
+    leaves: tuple[PeerTime, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

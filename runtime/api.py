@@ -1069,6 +1069,8 @@ def simulate(
     seed: int | None = None,
     method: str | None = None,
     impulse: str | None = None,
+    joins: Mapping[str, str | float] | None = None,
+    leaves: Mapping[str, str | float] | None = None,
     trace_of: Literal["worst"] | None = None,
     error: bool = False,
 ) -> Trajectory:
@@ -1094,6 +1096,9 @@ def simulate(
         linear equations, and CVODES for nonlinear ones.
     impulse
         A peer with an impulse at the start, such as "user[1]": its device has an initial velocity of 0.1 m/s.
+    joins, leaves
+        The instants at which peers join after the start and leave before the end, such as
+        `{"user[3]": "1 s"}`, or numbers in seconds; by default those of the model's experiment.
     trace_of
         "worst": packets are lost in the periodic pattern for which `analyze` finds instability.
     error
@@ -1102,7 +1107,8 @@ def simulate(
     Returns
     -------
     Trajectory
-        One row for every tick of the fastest clock, with the values before the tick, and a summary.
+        One row for every tick of the fastest clock, with the values before the tick, and a summary. Values of
+        a peer that is absent are NaN.
 
     Raises
     ------
@@ -1121,6 +1127,9 @@ def simulate(
             duration = float(push.WATCHED)
     if trace_of is not None:
         system = require_extension("loss_models").worst_trace(system)
+    if joins or leaves:
+        texts = ([f"{peer}={_time(at)}" for peer, at in (times or {}).items()] for times in (joins, leaves))
+        system = require_extension("changing_counts").with_peer_times(system, *texts)
     return trajectory.simulate(
         system,
         duration=_duration(duration),
@@ -1138,7 +1147,12 @@ def _duration(duration: str | float | None) -> Fraction | None:
         return None
     from apc.simulation.trajectory import parse_duration
 
-    return parse_duration(duration if isinstance(duration, str) else f"{float(duration)!r} s")
+    return parse_duration(_time(duration))
+
+
+def _time(time: str | float) -> str:
+    """Return a time as text; a number is in seconds."""
+    return time if isinstance(time, str) else f"{float(time)!r} s"
 
 
 @checked

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from fractions import Fraction
 
-from apc.compiler.compiled import Axis, Experiment
+from apc.compiler.compiled import Axis, Experiment, PeerTime
 from apc.compiler.components.component import NumberParameter
 from apc.compiler.language.unit_text import format_dimension
 from apc.compiler.language.values import AlreadyReportedError, ScalarValue
@@ -29,15 +29,15 @@ from apc.compiler.source.reading import (
 from apc.compiler.topology.instances import SettableNames
 from apc.compiler.topology.topology_parameters import NamedNumbers
 
-EXPERIMENT = ("duration", "seed")
+EXPERIMENT = ("duration", "seed", "joins", "leaves")
 AXES = ("x", "y")
 TUNED = ("free", "maximize", "minimize", "subject", "over", "hands")
 
 
 def read_experiment(root: MappingReader, numbers: NamedNumbers) -> Experiment:
-    """Return the experiment, from the section `experiment: {duration: 3 s, seed: 1}`.
+    """Return the experiment, from the section `experiment: {duration: 3 s, joins: {"user[3]": 1 s}}`.
 
-    `numbers` reads the duration.
+    `numbers` reads the times.
     """
 
     def duration(node: Node, subject: str) -> Fraction:
@@ -54,8 +54,17 @@ def read_experiment(root: MappingReader, numbers: NamedNumbers) -> Experiment:
             raise fault("E203", node.location, subject, "a whole number, 0 or more", form(node))
         return number
 
+    def peer_time(name: Scalar, node: Node) -> PeerTime:
+        """Return the instant of one peer, in seconds."""
+        at = numbers.read_time(node, name.text, "s").number
+        return PeerTime(name.text, at, name.location.line, name.location.column)
+
     section = _section(root, "experiment", EXPERIMENT, "{duration: 3 s}")
-    return Experiment(section.read("duration", duration, None), section.read("seed", seed, 0))
+    return Experiment(
+        section.read("duration", duration, None),
+        section.read("seed", seed, 0),
+        *(tuple(section.each(key, '{"user[3]": 1 s}', peer_time)) for key in ("joins", "leaves")),
+    )
 
 
 def _section(parent: MappingReader, key: str, keys: tuple[str, ...], fix: str) -> MappingReader:

@@ -97,7 +97,8 @@ def motion_of(system: Model, *, struck: bool) -> AnimationFrames:
     simulated = simulate(system, duration=duration, signals=[text for name in names for text in name])
     values, time = simulated.values, simulated.time
     indices = [number for number, signal in enumerate(simulated.signals) if signal.unit == "m"]
-    left_picture = np.abs(values - values[0])[:, indices].max(axis=1) > FAR
+    distances = np.abs(values - np.nan_to_num(values[0]))  # NaN at absent peers
+    left_picture = np.fmax.reduce(distances[:, indices], axis=1) > FAR
     if left_picture.any():
         last = max(int(np.argmax(left_picture)), 2)
         values, time = values[:last], time[:last]

@@ -37,6 +37,7 @@ from apc.parameter_values.parameters import resolve
 from apc.result import Result
 from apc.simulation.flow import state_scales
 from apc.simulation.output_blocks import blocks
+from apc.simulation.presence import refuse_joins_and_leaves
 from apc.simulation.settings import CVODES, DEFAULT, EXACT, RK4, SEMI_IMPLICIT, Method, Settings, finer
 from apc.simulation.simulation import Simulation, prepare
 from apc.support.distribution import versions
@@ -279,6 +280,7 @@ def bench_simulation(system: Model, duration: Fraction = DURATION, *, rounds: in
     relative to the largest value of all states with the same unit. The error of the exact transition is its
     change if every coefficient is changed by one rounding (see `accuracy`).
     """
+    refuse_joins_and_leaves(system, "apc bench")
     notes = []
     if _is_at_rest(system, duration):
         system, how = _with_displaced_start(system)

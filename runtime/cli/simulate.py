@@ -59,6 +59,8 @@ def simulate_command(
         show_default="exact",
     ),
     impulse: str | None = option("Start the device of a peer at 0.1 m/s.", "PEER"),
+    joins: tuple[str, ...] = option("Join of a peer (repeatable).", '"PEER=TIME"'),
+    leaves: tuple[str, ...] = option("Leave of a peer (repeatable).", '"PEER=TIME"'),
     trace_of: str | None = option("Use the worst loss pattern of analyze.", type=click.Choice(["worst"])),
     error: bool = option("Estimate the error with a more accurate run."),
 ) -> None:
@@ -79,6 +81,7 @@ def simulate_command(
         apc simulate --signals cube.x --out run.csv
         apc simulate --out run.gif
         apc simulate --impulse "user[1]" --plot run.png
+        apc simulate --joins "user[3]=1 s" --leaves "user[1]=2 s"
         apc simulate --runs 1000 --seed 1 --jobs 4
         apc simulate --method semi-implicit:1ms --error
     """
@@ -99,6 +102,10 @@ def simulate_command(
         from apc.support.extension_table import require_extension
 
         system = require_extension("loss_models").worst_trace(system)
+    if joins or leaves:
+        from apc.support.extension_table import require_extension
+
+        system = require_extension("changing_counts").with_peer_times(system, joins, leaves)
     if impulse is not None:
         from apc.simulation.initial_velocity import WATCHED, impulse_text
         from apc.simulation.initial_velocity import initial_velocity as struck

@@ -64,6 +64,7 @@ QUANTITIES = {
 }
 DASHES = ("-", (0, (4, 1.5)), (0, (1, 1)), (0, (5, 1, 1, 1)), (0, (7, 2)), (0, (3, 1, 1, 1, 1, 1)))
 MOST_COLOURS = 10  # peers with a colour each; of more each group has one
+MOST_CHANGES = 8  # joins and leaves in a text
 ROUNDING = 1e-9  # of what a panel spans
 LABEL = 36  # letters of a line of a legend
 MOST_LIMITS = 4  # printed as text; the document has all
@@ -204,6 +205,10 @@ def provenance_document(provenance: Provenance) -> Plain:
         "parameters": {name: {"value": value, "unit": unit} for name, value, unit in provenance.parameters},
         "timings": ...,
         "timings_s": dict(provenance.timings),
+        "joins": ...,
+        "joins_s": {item.peer: str(item.at) for item in provenance.joins},
+        "leaves": ...,
+        "leaves_s": {item.peer: str(item.at) for item in provenance.leaves},
         "versions": dict(provenance.versions),
     }
     return record(provenance, instead)
@@ -305,7 +310,7 @@ def _draw_paths(ax: Any, trajectory: Trajectory, paths: Sequence[tuple[int, int]
 def _panel(ax: Any, trajectory: Trajectory, unit: str, indices: Sequence[int]) -> None:
     """Draw the signals of one unit, the columns `indices` of a trajectory, as curves over time."""
     title = QUANTITIES.get(unit, "")
-    largest = float(np.abs(trajectory.values[:, list(indices)]).max(initial=0.0))
+    largest = float(np.fmax.reduce(np.abs(trajectory.values[:, list(indices)]), axis=None, initial=0.0))
     scale, shown = prefixed(largest, unit)
     signals, values = trajectory.signals, scale * trajectory.values
     many = _are_many(signals)
@@ -333,10 +338,12 @@ def _are_many(signals: Sequence[Signal]) -> bool:
 def _identical(values: Floats, indices: Sequence[int]) -> list[list[int]]:
     """Return indices grouped by curve: one group differs only by rounding, relative to the panel's range."""
     result: list[list[int]] = []
-    off = ROUNDING * float(np.ptp(values[:, indices]))
+    off = ROUNDING * float(np.nanmax(values[:, indices]) - np.nanmin(values[:, indices]))
     for index in indices:
         same = (
-            numbers for numbers in result if np.abs(values[:, index] - values[:, numbers[0]]).max() <= off
+            numbers
+            for numbers in result
+            if np.allclose(values[:, index], values[:, numbers[0]], rtol=0, atol=off, equal_nan=True)
         )
         if (curve := next(same, None)) is None:
             result.append(curve := [])
@@ -509,8 +516,15 @@ def _facts(simulated: SimulationReport, units: Mapping[str, str]) -> Iterator[tu
     if any(value for _, value in summary.work):
         done = ", ".join(f"{part} {_quantity(value, 'J')}" for part, value in summary.work)
         yield "energy generated", f"{done} (by sample-and-hold)"
+    provenance = simulated.provenance
+    changes = [(item.at, f"{item.peer} joins") for item in provenance.joins]
+    changes += [(item.at, f"{item.peer} leaves") for item in provenance.leaves]
+    if changes:
+        texts = [f"{text} at {_quantity(float(at), 's')}" for at, text in sorted(changes)]
+        more = [f"{len(texts) - MOST_CHANGES} more changes"] if len(texts) > MOST_CHANGES else []
+        yield "peers", ", ".join(texts[:MOST_CHANGES] + more)
     yield "recorded", f"{summary.rows} samples of {summary.signals} signals until {summary.end:g} s"
-    if simulated.provenance.method != EXACT:
-        yield "method", _method(simulated.provenance)
+    if provenance.method != EXACT:
+        yield "method", _method(provenance)
     if simulated.error:
         yield "error", error_text(simulated.error)

@@ -236,7 +236,7 @@ def keep_in_sight(axes: Sequence[Any]) -> None:
 
 def widen(actor: Actor, track: NDArray[np.float64]) -> None:
     """Take into an Axes' data limits all places of a body (rows, d), in mm."""
-    for corner in (track.min(axis=0) - actor.half, track.max(axis=0) + actor.half):
+    for corner in (np.fmin.reduce(track) - actor.half, np.fmax.reduce(track) + actor.half):
         actor.ax.update_datalim([corner if len(corner) > 1 else (*corner, actor.row)])
 
 

@@ -80,13 +80,13 @@ class AccuracyEstimator:
         if not reference or not rows:
             return
         values = block.values[:rows]
-        errors = self.factor * np.abs(values - reference.values[:rows])
+        errors = self.factor * np.nan_to_num(np.abs(values - reference.values[:rows]))  # 0 at absent peers
         larger = errors.max(axis=0) > self.error
         self.at[larger] = block.time[errors.argmax(axis=0)[larger]]
         self.error = np.maximum(self.error, errors.max(axis=0))
         self.low, self.high = (
-            np.minimum(self.low, values.min(axis=0)),
-            np.maximum(self.high, values.max(axis=0)),
+            np.fmin(self.low, np.fmin.reduce(values)),
+            np.fmax(self.high, np.fmax.reduce(values)),
         )
 
     def estimate(self) -> ErrorEstimate:

@@ -2,7 +2,7 @@
 
 Takes: a `Simulation`. Gives: `OutputBlock`, `blocks`; `instants_of`, `forces_in_time`, `unsolved`.
 Guarantees: a row for time 0 and for every tick of the fastest clock until the end, values before the tick;
-the memory used does not grow with the duration; every returned number is finite.
+the memory used does not grow with the duration; every returned number is finite, or NaN at an absent peer.
 Does not: store, write or evaluate the rows (see `trajectory`, `recording`, `summary`).
 """
 
@@ -30,8 +30,8 @@ class OutputBlock:
     """A block of rows: `time` (rows,) in seconds, `values` (rows, signals) in SI.
 
     `work` (parts,) is the work in J of each part over all peers, up to the last frame that begins within the
-    block. `stopped` is the name of the signal that left the range of floats after the last row, at
-    `stopped_at` seconds; "" if all are finite.
+    block; a value of an absent peer is NaN. `stopped` is the name of the signal that left the range of floats
+    after the last row, at `stopped_at` seconds; "" if all are finite.
     """
 
     time: Floats
@@ -76,6 +76,8 @@ def blocks(
         values = simulated.rows[is_row][:, simulation.order]
         time = instants[is_row] * simulation.quantum.numerator / simulation.quantum.denominator
         finite = np.isfinite(values)
+        if simulation.presence is not None:
+            finite |= ~simulation.presence.of(simulation.signals, instants[is_row])
         stop = int(np.argmin(np.append(finite.all(axis=1), False)))  # the first row that is not finite
         if stop:  # to the last frame that begins by the last row
             work = simulated.work[int(np.flatnonzero(is_row)[stop - 1]) // sample_times]

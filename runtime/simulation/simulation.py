@@ -41,6 +41,7 @@ from apc.simulation.population import (
     instants_within,
     refuse_unheard_of,
 )
+from apc.simulation.presence import Presence
 from apc.simulation.program import GroupProgram, Program, build_member
 from apc.simulation.program_builder import build_program
 from apc.simulation.propagate import perturbed, rates, transition_rows
@@ -53,6 +54,7 @@ from apc.simulation.signals import (
     sent_states,
     signals_of,
 )
+from apc.support.extension_table import require_extension
 from apc.support.memory import refuse_beyond
 from apc.timing.communication_graph import CommunicationGraph, build_exchange
 from apc.timing.schedule import Propagate, Schedule
@@ -90,7 +92,8 @@ class Simulation:
     `arrival_processes` are the random losses and delays of the unreliable links, with the seed `seed`.
     `library` is the machine code, None if there is none. `length` frames are simulated per chunk. `topology`
     is the given model, without time stamps on its packets (see `data_age.stamped`). `tolerances` are those of
-    the states integrated by CVODES, `sent` the names of the states that peers send unchanged.
+    the states integrated by CVODES, `sent` the names of the states that peers send unchanged. `presence` are
+    the instants at which peers join and leave, None if all peers are always present.
     """
 
     system: Model
@@ -110,6 +113,7 @@ class Simulation:
     ticks_at_zero: bool
     library: LoadedLibrary | None
     length: int
+    presence: Presence | None = None
 
     @property
     def how(self) -> str:
@@ -126,6 +130,9 @@ class Simulation:
 
     def player(self) -> FrameEngine:
         """Return a new engine for this simulation, with its own memory."""
+        if self.presence is not None:
+            engine: FrameEngine = require_extension("changing_counts").changing_engine(self)
+            return engine
         routes = self.population.exchange_program.routes
         timetable = partial(Timetable, routes, self.arrival_processes, seed=self.seed)
         packets = (lambda run: timetable(run=run)) if routes else None
@@ -160,8 +167,8 @@ def prepare(
     ApcError
         E870 a continuous equation is not linear and the method is exact, E873 a pattern without a match, E874
         the peers are too many, E893 a peer has no own value as the substitute for a missing packet, E899 a
-        delay is a range, E913 a step that does not fit; and the errors of `build_schedules`,
-        `build_population` and `routes_of`.
+        delay is a range, E913 a step that does not fit, E914 an invalid join or leave; and the errors of
+        `build_schedules`, `build_population` and `routes_of`.
     """
     topology = system
     refuse_unheard_of(system)
@@ -173,6 +180,10 @@ def prepare(
         members = _members(plan, choices, settings.method, live=live)
         population = build_population(plan.exchange, members, plan.routes)
     schedule, recorded = plan.schedules[0], signals_of(system, choices)
+    presence: Presence | None = None
+    if system.experiment.joins or system.experiment.leaves:
+        extension = require_extension("changing_counts")
+        presence = extension.presence_of(system, schedule, settings.duration)
     sample_times = schedule.sample_times[:-1]
     timings, quantum = plan.numbers.timings, schedule.quantum
     return Simulation(
@@ -199,6 +210,7 @@ def prepare(
         ticks_at_zero=_ticks_at_zero(system, plan.numbers),
         library=library_of(population) if settings.jit else None,
         length=_chunk_length(population, settings.duration),
+        presence=presence,
     )
 
 

@@ -65,6 +65,7 @@ ROUNDING = 1e-9  # of the largest range in its unit: a position of smaller range
 MOST_EXTREMES = 2**22  # numbers stored in each of three tables: 32 MiB
 FEWEST_GROUPS = 16  # least number of groups of rows, each with common extremes
 MOST_FITTED = 1024  # positions whose last rows are stored for a fit
+CHANGED = "peers join or leave in the last tenth of the duration"
 SHORT = "the duration is too short, or the motion too irregular, to fit a decay rate"
 CONTRADICTION = "the motion within this duration differs from the verdict of the linear topology"
 MOST_LINEAR = 60  # peers of a linear model up to which the verdict is compared with an analysis
@@ -151,7 +152,16 @@ class SummaryAccumulator:
         self.simulation, self.signals = simulation, simulation.signals
         self.until = driven_until(simulation) if until is None else until
         n = len(self.signals)
-        self.positions = [i for i, signal in enumerate(self.signals) if is_position(signal)]
+        # The last instant in s of a join or leave, and the signals of peers that are present at the end.
+        self.changed, self.present = 0.0, np.ones(n, np.bool_)
+        if simulation.presence is not None:
+            end = np.array([int(simulation.settings.duration / simulation.quantum)])
+            self.present = simulation.presence.of(self.signals, end)[0]
+            changes = simulation.presence.changes(int(end[0])).tolist()
+            self.changed = float(max(changes, default=0) * simulation.quantum)
+        self.positions = [
+            i for i, signal in enumerate(self.signals) if is_position(signal) and self.present[i]
+        ]
         self.forces = [
             i for i, signal in enumerate(self.signals) if signal.unit == "N" and signal.role != "limited"
         ]
@@ -163,7 +173,7 @@ class SummaryAccumulator:
         self.fitted = self.positions[:: -(-len(self.positions) // MOST_FITTED) or 1]
         stored = min(simulation.rows, MOST_EXTREMES // max(len(self.fitted), 1))
         self.samples, self.instants = np.zeros((stored, len(self.fitted))), np.zeros(stored)
-        self.first, self.last = np.zeros(n), np.zeros(n)
+        self.first, self.last = np.full(n, np.nan), np.full(n, np.nan)
         self.peak, self.peak_at = np.full(n, -1.0), np.zeros(n)
         self.beyond = np.full(len(self.limits), np.nan)
         self.rows = 0
@@ -172,20 +182,21 @@ class SummaryAccumulator:
         """Update the extremes by some rows: `time` (rows,), `values` (rows, signals)."""
         if not len(time):
             return
-        if not self.rows:
-            self.first = values[0].copy()
-        self.last = values[-1].copy()
+        # A peer that joins or leaves has NaN while it is absent.
+        self.first = np.where(np.isnan(self.first), _first_finite(values), self.first)
+        last = _first_finite(values[::-1])
+        self.last = np.where(np.isnan(last), self.last, last)
         group = (self.rows + np.arange(len(time))) // self.width
         index = (self.rows + np.arange(len(time)))[-len(self.samples) :] % len(self.samples)
         self.samples[index] = values[-len(self.samples) :, self.fitted]
         self.instants[index] = time[-len(self.samples) :]
         self.rows += len(time)
         groups, starts = np.unique(group, return_index=True)
-        self.low[groups] = np.minimum(self.low[groups], np.minimum.reduceat(values, starts))
-        self.high[groups] = np.maximum(self.high[groups], np.maximum.reduceat(values, starts))
+        self.low[groups] = np.fmin(self.low[groups], np.fmin.reduceat(values, starts))
+        self.high[groups] = np.fmax(self.high[groups], np.fmax.reduceat(values, starts))
         self.ends[group] = time
         columns = np.array([*self.forces, *(column for column, _, _ in self.limits)], np.int64)
-        size = np.abs(values[:, columns])
+        size = np.nan_to_num(np.abs(values[:, columns]))
         largest = size.max(axis=0)
         increased = largest > self.peak[columns]
         self.peak[columns[increased]] = largest[increased]
@@ -249,7 +260,7 @@ class SummaryAccumulator:
             end=float(ends[-1]),
             extents=extents,
             broken=self._broken(),
-            unrecorded=_position_count(self.simulation.system) - len(self.positions),
+            unrecorded=_position_count(self.simulation.system) - sum(map(is_position, self.signals)),
         )
 
     def _verdict(
@@ -268,6 +279,8 @@ class SummaryAccumulator:
             return MotionVerdict.NOT_DETERMINED, "no position was recorded"
         if self.until > LATE * end:
             return MotionVerdict.DRIVEN, ""
+        if self.changed > LATE * end:
+            return MotionVerdict.NOT_DETERMINED, CHANGED
         if all(extent.low == extent.high for extent in position_ranges):
             return MotionVerdict.AT_REST, ""
         if fit is None:
@@ -298,7 +311,7 @@ class SummaryAccumulator:
     def _fit(self, span: Floats, end: float) -> Fit | None:
         """Return the fit of the stored rows after `until`, None without rows or positions."""
         stored = np.arange(max(self.rows - len(self.samples), 0), self.rows) % len(self.samples)
-        stored = stored[self.instants[stored] >= self.until]
+        stored = stored[self.instants[stored] >= max(self.until, self.changed)]
         if len(stored) < 2 or not self.fitted:
             return None
         # Lengths are compared with lengths, angles with angles.
@@ -316,7 +329,7 @@ class SummaryAccumulator:
             indices = [
                 i
                 for i, signal in enumerate(self.signals)
-                if signal.local == name and signal.unit in POSITIONS
+                if signal.local == name and signal.unit in POSITIONS and self.present[i]
             ]
             if len(indices) > 1:
                 copies.append((name, float(np.ptp(self.last[indices]))))
@@ -338,6 +351,11 @@ class SummaryAccumulator:
             if not np.isnan(first)
         ]
         return tuple(sorted(broken, key=lambda limit: limit.first_s))
+
+
+def _first_finite(values: Floats) -> Floats:
+    """Return the first finite value of each column (rows, n), NaN where there is none."""
+    return values[np.isfinite(values).argmax(axis=0), np.arange(values.shape[1])]
 
 
 def _limits(system: Model, signals: Sequence[Signal]) -> list[tuple[int, str, float]]:

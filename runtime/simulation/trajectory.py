@@ -3,8 +3,8 @@
 Takes: a `Simulation`. Gives: `simulate`, `run_simulation`; `Trajectory`, `trajectory_of`, `SimulationReport`,
 `Provenance`, `provenance_of`; `Sink`, `Keeper`, consumers of rows; `parse_duration`, `duration_of`,
 `parameters_of`, `texts_of`.
-Guarantees: no number is NaN or infinite; a diverging simulation is stored up to the last finite row, and
-reported.
+Guarantees: no number is infinite, and NaN only at an absent peer; a diverging simulation is stored up to the
+last finite row, and reported.
 Does not: write files, or draw (see `output`).
 """
 
@@ -19,7 +19,7 @@ from typing import Any, Protocol, Unpack
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.compiled import Model
+from apc.compiler.compiled import Model, PeerTime
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.timings import part
 from apc.result import PlotStyle, Result
@@ -44,7 +44,8 @@ MOST_LISTED = 1000  # peers whose own parameters are listed; the digest of their
 class Provenance:
     """The origin of a result: topology, method, seed, parameters and versions.
 
-    `texts` is the SHA-256 of all texts of the model; `parameters` are (name, value in SI, unit).
+    `texts` is the SHA-256 of all texts of the model; `parameters` are (name, value in SI, unit). `joins` and
+    `leaves` are the peers that join and leave.
     """
 
     topology: str
@@ -55,6 +56,8 @@ class Provenance:
     seed: int
     parameters: tuple[tuple[str, float, str], ...]
     timings: tuple[tuple[str, str], ...]
+    joins: tuple[PeerTime, ...] = ()
+    leaves: tuple[PeerTime, ...] = ()
 
     @property
     def versions(self) -> tuple[tuple[str, str], ...]:
@@ -128,6 +131,8 @@ def provenance_of(simulation: Simulation) -> Provenance:
         seed=simulation.seed,
         parameters=parameters_of(system),
         timings=tuple((timing.name, str(timing.value)) for timing in system.timings),
+        joins=system.experiment.joins,
+        leaves=system.experiment.leaves,
     )
 
 
@@ -207,7 +212,7 @@ def run_simulation(
             raise
         interrupted = True
     summary = accumulator.summary(block)
-    if simulation.settings.method.name in (EXACT, WHERE_NEEDED):
+    if simulation.settings.method.name in (EXACT, WHERE_NEEDED) and simulation.presence is None:
         summary = checked_by_analysis(summary, simulation.topology)
     return summary, interrupted
 

@@ -12,6 +12,7 @@ from fractions import Fraction
 from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.lifting.rest_position import START, OperatingPoint, operating_point_from
+from apc.simulation.presence import refuse_joins_and_leaves
 from apc.simulation.trajectory import simulate
 
 SIMULATION = "simulation"
@@ -41,6 +42,7 @@ def operating_point(
     if initial != SIMULATION:
         location, expected = SourceLocation("operating_point"), f"{START} or {SIMULATION}"
         raise ApcError(Diagnostic("E840", location, "initial", expected, initial[:40]))
+    refuse_joins_and_leaves(system, "operating_point")
     trajectory = simulate(system, duration=duration)
     final = {
         signal.name: float(value)

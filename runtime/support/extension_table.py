@@ -48,8 +48,13 @@ EXTENSIONS = {
         Extension(
             "changing_counts",
             "stability while users join and leave",
-            "--changing; apc.changing_counts",
-            ("joins_and_leaves:changing_counts",),
+            "--changing; apc.changing_counts; joins and leaves of a simulation",
+            (
+                "changing_engine:changing_engine",
+                "joins_and_leaves:changing_counts",
+                "peer_times:presence_of",
+                "peer_times:with_peer_times",
+            ),
             "changing_counts_output",
         ),
         Extension(

@@ -45,6 +45,7 @@ CALLS = (
     "simulate --duration 20_ms --no-jit --json",
     "simulate --duration 20_ms --method rk4:1e-4 --error",
     "simulate --duration 20_ms --impulse PEER --runs 2",
+    "simulate --duration 2_s --joins PEER=600_ms --leaves PEER=1200_ms",
     "export --to control --out e.py",
     "export --to modelica --out e.mo",
     "export --to c --peer PEER --out e.c",

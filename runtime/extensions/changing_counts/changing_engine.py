@@ -1,0 +1,235 @@
+"""An engine for peers that join and leave: one simulation for each set of present peers.
+
+Takes: a `Simulation` with its `Presence`.
+Gives: `changing_engine`.
+Guarantees: between changes the motion is exactly that of a model of the present peers alone. The rows of
+absent peers are NaN.
+Does not: read the instants (see `peer_times`).
+
+At the start of the frame of a change, in this order:
+
+1. The peers that leave are removed, with all their packets, also those in transit.
+2. Each peer that joins has its start values. The states and stored values of its parts in `PeerType.joining`
+   (shared objects, and the parts that send) are the mean of those of the peers that stay.
+3. The packets of a peer that joins are, at each instant of sending, the mean m of the packets of the peers of
+   its group that stay, shifted to its own values: m + s(own values) − mean of s(values of the others), where
+   s gives the sent values. If all its sent values are means, so are its packets.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.compiler.compiled import PeerType
+from apc.extensions.changing_counts.peer_times import model_of_present
+from apc.simulation.output_blocks import forces_in_time
+from apc.simulation.population import FrameEngine, FrameRows, PopulationState
+from apc.simulation.program import GroupProgram
+from apc.simulation.simulation import Simulation, prepare
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Flags = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PresentPeers:
+    """The simulation of the present peers (`present`, (N,)), with its engine.
+
+    `sources` are the columns of its rows that are recorded in the columns `targets` of all peers' rows.
+    """
+
+    present: Flags
+    simulation: Simulation
+    engine: FrameEngine
+    sources: Integers
+    targets: Integers
+
+    @property
+    def state(self) -> PopulationState:
+        """The stored values of the engine."""
+        assert isinstance(self.engine, PopulationState)
+        return self.engine
+
+    def indices(self, group: int, peers: Flags) -> Integers:
+        """Return the indices of some peers (N,) among the present peers of a group."""
+        first = np.cumsum([0, *(model_group.count for model_group in self.simulation.system.groups)])
+        position = np.cumsum(self.present) - 1
+        of_group = position[peers & self.present]
+        return of_group[(first[group] <= of_group) & (of_group < first[group + 1])] - first[group]
+
+
+def changing_engine(simulation: Simulation) -> FrameEngine:
+    """Return an engine of a simulation in which peers join and leave."""
+    return _ChangingEngine(simulation)
+
+
+class _ChangingEngine:
+    """An engine that passes from one set of present peers to the next."""
+
+    def __init__(self, simulation: Simulation) -> None:
+        assert simulation.presence is not None
+        self.simulation, self.presence = simulation, simulation.presence
+        last = int(simulation.settings.duration / simulation.quantum)
+        self.changes = (self.presence.changes(last) // simulation.frame).tolist()
+        self.prepared: dict[bytes, PresentPeers] = {}
+        self.begin(0)
+
+    def begin(self, run: int) -> None:
+        """Reset all peers to time 0 of a run (see `FrameEngine`)."""
+        self.run, self.work_of_absent = run, np.zeros(len(self.simulation.population.parts))
+        self.now = self._present_at(0)
+        self.now.engine.begin(run)
+
+    def advance(self, first: int, count: int, pushes: Sequence[Floats | None]) -> FrameRows:
+        """Simulate the frames from number `first` on (see `FrameEngine`); forces are computed here."""
+        population = self.simulation.population
+        rows = np.full((count, population.sample_count, population.width), np.nan)
+        work = np.zeros((count, len(population.parts)))
+        ends = [*(frame for frame in self.changes if first < frame < first + count), first + count]
+        begin = first
+        for end in ends:
+            if begin in self.changes:
+                self._change(begin)
+            now, length = self.now, end - begin
+            forces = forces_in_time(replace(now.simulation, length=length), begin)
+            simulated = now.engine.advance(begin, length, forces)
+            done = slice(begin - first, begin - first + simulated.frames)
+            own_rows = simulated.rows.reshape(length, population.sample_count, -1)
+            rows[done, :, now.targets] = own_rows[: simulated.frames, :, now.sources]
+            work[done] = self.work_of_absent + simulated.work[: simulated.frames]
+            begin += simulated.frames
+            if simulated.frames < length:
+                break
+        return FrameRows(rows.reshape(-1, population.width), work, begin - first)
+
+    def in_range(self) -> bool:
+        """Return whether all states of the present peers are finite."""
+        return self.now.engine.in_range()
+
+    def _present_at(self, frame: int) -> PresentPeers:
+        """Return the simulation of the peers that are present in a frame."""
+        present = self.presence.at(np.array([frame * self.simulation.frame]))[0]
+        key = present.tobytes()
+        if key not in self.prepared:
+            self.prepared[key] = self._prepare(present)
+        return self.prepared[key]
+
+    def _prepare(self, present: Flags) -> PresentPeers:
+        """Return the simulation of some peers, with the signals of all their groups' recorded signals."""
+        base = self.simulation
+        patterns = dict.fromkeys(f"{signal.group}.{signal.local}" for signal in base.signals)
+        model = model_of_present(base.topology, present)
+        simulation = prepare(model, base.settings, signals=tuple(patterns))
+        assert len(simulation.population.members) == len(model.groups), "all peers of a group are recorded"
+        starts, column_of = self.presence.first_peers, {}
+        for signal, column in zip(base.signals, base.order.tolist(), strict=True):
+            column_of[signal.group, starts[signal.group] + signal.peer - 1, signal.local] = column
+        peers, counts = np.flatnonzero(present), [group.count for group in model.groups]
+        first = dict(zip(starts, np.cumsum([0, *counts]).tolist(), strict=False))
+        pairs = [
+            (source, column_of[key])
+            for signal, source in zip(simulation.signals, simulation.order.tolist(), strict=True)
+            if (key := (signal.group, int(peers[first[signal.group] + signal.peer - 1]), signal.local))
+            in column_of
+        ]
+        sources, targets = np.array(pairs, np.int64).reshape(-1, 2).T
+        return PresentPeers(present, simulation, simulation.player(), sources, targets)
+
+    def _change(self, frame: int) -> None:
+        """Pass to the peers that are present from a frame on."""
+        old, new = self.now, self._present_at(frame)
+        members = list(zip(old.simulation.population.members, old.state.carries, strict=True))
+        for group, (member, carry) in enumerate(members):
+            layout, leaving = member.program.layout, old.indices(group, ~new.present)
+            parts = [self.simulation.population.parts.index(part) for part in layout.parts]
+            np.add.at(self.work_of_absent, parts, carry[layout.work][:, leaving].sum(axis=1))
+        carries, packets = _changed(old, new, frame)
+        new.engine.begin(self.run)
+        for array, values in zip(new.state.carries, carries, strict=True):
+            array[:] = values
+        new.state.packets[:] = packets
+        self.now = new
+
+
+def _changed(old: PresentPeers, new: PresentPeers, frame: int) -> tuple[list[Floats], Floats]:
+    """Return the carries of each group and the packets of the peers present after a change."""
+    stay, join = old.present & new.present, new.present & ~old.present
+    before, after = old.simulation.population, new.simulation.population
+    means = _state_means(old, stay)
+    packets = np.empty(new.state.packets.shape)
+    carries, column, old_column = [], 0, 0
+    for group, member in enumerate(after.members):
+        staying, old_staying = new.indices(group, stay), old.indices(group, stay)
+        joining, old_carry = new.indices(group, join), old.state.carries[group]
+        carry = member.each(member.carry).T.copy()
+        carry[:, staying] = old_carry[:, old_staying]
+        columns = slice(column, column + member.count)
+        own = packets[:, :, columns]
+        own[:, :, staying] = old.state.packets[:, :, old_column + old_staying]
+        if len(joining):
+            _set_joining_values(member, carry, joining, staying, means)
+            seconds = float(frame * after.frame * after.quantum)
+            mean_packets = own[:, :, staying].mean(axis=2) if len(staying) else 0.0
+            for key, sent in enumerate(after.exchange_program.keys):
+                values = _sent(member, carry, sent.link, sent.channel, seconds)
+                mean_value = values[staying].mean() if len(staying) else 0.0
+                history = mean_packets[:, key] if len(staying) else np.zeros(len(packets))
+                own[:, key, joining] = history[:, None] + (values[joining] - mean_value)
+        carries.append(carry)
+        column, old_column = column + member.count, old_column + before.members[group].count
+    return carries, packets
+
+
+def _state_means(old: PresentPeers, stay: Flags) -> dict[str, float]:
+    """Return the mean of each state over the staying peers of all groups that have it."""
+    values: dict[str, list[Floats]] = {}
+    for group, member in enumerate(old.simulation.population.members):
+        staying = old.indices(group, stay)
+        for row, state in enumerate(member.program.peer_type.states):
+            values.setdefault(state.name, []).append(old.state.carries[group][row, staying])
+    joined = {name: np.concatenate(arrays) for name, arrays in values.items()}
+    return {name: float(array.mean()) for name, array in joined.items() if len(array)}
+
+
+def _set_joining_values(
+    member: GroupProgram, carry: Floats, joining: Integers, staying: Integers, means: dict[str, float]
+) -> None:
+    """Set the rows of a carry that belong to the parts in `PeerType.joining`, at the joining peers.
+
+    States are the means over all groups, other stored values the means over the peers of the group.
+    """
+    peer_type, layout = member.program.peer_type, member.program.layout
+    for row, state in enumerate(peer_type.states):
+        if _is_mean(peer_type, state.name) and state.name in means:
+            carry[row, joining] = means[state.name]
+    partitions = {partition.clock: partition for partition in peer_type.clocks}
+    names = [
+        *(peer_type.clocks[partition].outputs[output] for partition, output in layout.outputs),
+        *(partitions[hold.clock].outputs[hold.output] for hold in peer_type.holds),
+        *(peer_type.clocks[value.partition].outputs[value.output] for value in layout.later_values),
+    ]
+    for row, name in enumerate(names, layout.states):
+        if _is_mean(peer_type, name) and len(staying):
+            carry[row, joining] = carry[row, staying].mean()
+
+
+def _is_mean(peer_type: PeerType, name: str) -> bool:
+    """Return whether a value belongs to a part whose values at a joining peer are means."""
+    return any(name.startswith(f"{part}.") for part in peer_type.joining)
+
+
+def _sent(member: GroupProgram, carry: Floats, link: str, channel: str, seconds: float) -> Floats:
+    """Return the values that each peer of a member sends in a channel (count,), 0 without such a channel."""
+    layout = member.program.layout
+    for send in member.program.peer_type.sends:
+        if send.link == link and channel in send.channels:
+            function = send.send.map(member.count)
+            parameters = member.each(member.parameters).T
+            values = function(carry[: layout.states], carry[layout.held], parameters, seconds)
+            return np.asarray(values, np.float64)[send.channels.index(channel)]
+    return np.zeros(member.count)

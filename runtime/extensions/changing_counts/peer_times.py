@@ -1,0 +1,239 @@
+"""The instants at which peers join and leave a simulation.
+
+Takes: texts of options; the joins and leaves of a model's experiment.
+Gives: `with_peer_times`, `presence_of`, `model_of_present`.
+Guarantees: all invalid instants are reported together (E914). Peers join and leave at the starts of frames.
+Does not: simulate (see `changing_engine`).
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+from fractions import Fraction
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.compiler.compiled import Group, Model, PeerTime, count_of, group_count
+from apc.compiler.errors import ApcError, Mistakes, SourceLocation
+from apc.compiler.language.units import quantity
+from apc.compiler.peer_counts import least_peers
+from apc.compiler.source.reading import fault
+from apc.parameter_values.overrides import OVERRIDE, Override, apply
+from apc.parameter_values.parameter_names import find
+from apc.simulation.presence import Presence, first_peers, location_of
+from apc.timing.schedule import Schedule
+
+Flags = NDArray[np.bool_]
+
+NEVER = np.iinfo(np.int64).max  # the instant of a leave that does not happen
+
+_PEER = re.compile(r"(?P<group>.+?)(\[(?P<number>\d{1,9})\])?", re.ASCII)
+
+
+def with_peer_times(system: Model, joins: Sequence[str], leaves: Sequence[str]) -> Model:
+    """Return a model whose experiment has these joins and leaves; those of the model if empty.
+
+    Parameters
+    ----------
+    system
+        The model.
+    joins, leaves
+        A peer and its instant each, such as "user[4]=2 s".
+
+    Raises
+    ------
+    ApcError
+        E914 a text of another form, and the errors of `units.quantity`.
+    """
+    mistakes, given = Mistakes(), dict[str, tuple[PeerTime, ...]]()
+    for key, texts in (("joins", joins), ("leaves", leaves)):
+        for text in texts:
+            with mistakes:
+                given[key] = (*given.get(key, ()), _peer_time(key, text))
+    mistakes.raise_if_any()
+    experiment = system.experiment
+    return replace(
+        system,
+        experiment=replace(
+            experiment,
+            joins=given.get("joins", experiment.joins),
+            leaves=given.get("leaves", experiment.leaves),
+        ),
+    )
+
+
+def _peer_time(key: str, text: str) -> PeerTime:
+    """Return the peer and the instant of a text such as "user[4]=2 s"."""
+    peer, equals, time = text.rpartition("=")
+    location = SourceLocation(f"--{key}")
+    if not (equals and peer.strip() and time.strip()):
+        raise fault("E914", location, key, "PEER=TIME", text[:80] or "nothing", f'--{key} "user[1]=2 s"')
+    try:
+        at = quantity(time.strip(), location, subject=peer.strip(), unit="s", before=f"{peer.strip()}=")
+    except ApcError as error:
+        raise ApcError(
+            replace(mistake, fix=f'--{key} "{mistake.fix}"' if mistake.fix else "")
+            for mistake in error.mistakes
+        ) from None
+    return PeerTime(peer.strip(), Fraction(at.value))
+
+
+def presence_of(system: Model, schedule: Schedule, duration: Fraction) -> Presence:
+    """Return the peers that are present at each instant of a simulation.
+
+    Parameters
+    ----------
+    system
+        The model, whose experiment has joins or leaves.
+    schedule
+        The schedule of a frame of the first group.
+    duration
+        The duration of the simulation in seconds.
+
+    Raises
+    ------
+    ApcError
+        E914 an invalid join or leave, or a model whose peers can't join and leave.
+    """
+    mistakes, frame_s = Mistakes(), schedule.frame_s
+    joins = np.zeros(system.peers, np.int64)
+    leaves = np.full(system.peers, NEVER)
+    first, last_of = first_peers(system), dict[tuple[str, int], PeerTime]()
+    _check_links(system, mistakes)
+    for key, array in (("joins", joins), ("leaves", leaves)):
+        for item in getattr(system.experiment, key):
+            with mistakes:
+                peer = first[(found := _peer_of(system, key, item))[0].name] + found[1] - 1
+                name = f"{found[0].name}[{found[1]}]"
+                if (key, peer) in last_of:
+                    raise _fault(system, key, item, name, f"one instant in {key}", "two")
+                last_of[key, peer] = item
+                _check_time(system, key, item, duration, frame_s)
+                array[peer] = int(item.at / schedule.quantum)
+                if key == "leaves" and item.at <= (join := joins[peer] * schedule.quantum):
+                    raise _fault(system, key, item, f"leave of {name}", f"after its join at {_s(join)}")
+    mistakes.raise_if_any()
+    presence = Presence(joins, leaves, first)
+    changes = presence.changes(int(duration / schedule.quantum))
+    for instant, present in zip([0, *changes.tolist()], presence.at(np.append(0, changes)), strict=True):
+        _check_counts(system, present, instant * schedule.quantum)
+    return presence
+
+
+def _check_links(system: Model, mistakes: Mistakes) -> None:
+    """Record each link that does not allow joins and leaves."""
+    key = "joins" if system.experiment.joins else "leaves"
+    location = location_of(system, key, getattr(system.experiment, key)[0])
+    for link in system.links:
+        if link.graph.shape == "arcs":
+            message = f"the graph of {link.name} lists peers by number, so that no peer can join or leave"
+            mistakes.add("E914", location, message, fix="graph: complete")
+        if link.channel is not None:
+            message = f"peers can't join or leave over {link.name}, which loses or delays packets at random"
+            mistakes.add("E914", location, message, advice="remove loss, jitter and trace of the link")
+
+
+def _peer_of(system: Model, key: str, item: PeerTime) -> tuple[Group, int]:
+    """Return the group and the number, from 1, of a peer such as "user[2]"; "user" is "user[1]"."""
+    parsed = _PEER.fullmatch(item.peer.strip())
+    groups = {group.name: group for group in system.groups}
+    group = groups.get(parsed["group"]) if parsed else None
+    if parsed and group and 1 <= (number := int(parsed["number"] or 1)) <= group.count:
+        return group, number
+    known = ", ".join(f"{group.name}[1] to {group.name}[{group.count}]" for group in system.groups[:4])
+    above = parsed and group and int(parsed["number"] or 1) > group.count
+    fix = f"--set {group_count(parsed['group'])}={parsed['number']}" if parsed and above else ""
+    raise _fault(system, key, item, key, f"a peer of the topology ({known})", item.peer[:40], fix)
+
+
+def _check_time(system: Model, key: str, item: PeerTime, duration: Fraction, frame_s: Fraction) -> None:
+    """Raise E914 for an instant that is not within the simulation, or not the start of a frame."""
+    subject = f"{key.removesuffix('s')} of {item.peer.strip()}"
+    if not 0 < item.at < duration:
+        raise _fault(system, key, item, subject, f"more than 0 s and less than the duration, {_s(duration)}")
+    if item.at % frame_s:
+        before = item.at // frame_s * frame_s
+        near = [at for at in (before, before + frame_s) if 0 < at < duration]
+        expected = f"the start of a frame of {1000 * float(frame_s):.9g} ms"
+        nearest = min(near, key=lambda at: abs(at - item.at), default=None)
+        listed = " or ".join(map(_s, near))
+        fix = "" if nearest is None else _written(key, item, _s(nearest))
+        raise _fault(system, key, item, subject, f"{expected}, {listed}" if near else expected, fix=fix)
+
+
+def _check_counts(system: Model, present: Flags, at: Fraction) -> None:
+    """Raise E914 if a group has no present peer from an instant on, or all groups too few."""
+    counts = _counts(system, present)
+    for group, count in zip(system.groups, counts, strict=True):
+        least = max(1, least_peers(system.peer_types) - sum(counts) + count)
+        if count < least:
+            items = [(key, item) for key in ("joins", "leaves") for item in getattr(system.experiment, key)]
+            key, item = next((pair for pair in reversed(items) if pair[1].at == at), items[0])
+            subject = f"peers of {group.name} from {_s(at)} on"
+            raise _fault(system, key, item, subject, f"at least {least}", str(count))
+
+
+def _counts(system: Model, present: Flags) -> list[int]:
+    """Return the number of present peers of each group."""
+    starts = [*first_peers(system).values()]
+    return np.add.reduceat(present.astype(np.int64), starts).tolist()
+
+
+def model_of_present(system: Model, present: Flags) -> Model:
+    """Return the model of the present peers (N,) only, numbered anew in each group, without joins and leaves.
+
+    Raises ApcError for numbers of peers that the model can't have.
+    """
+    own = {count_of(link.name) for link in system.links}
+    starts = first_peers(system)
+    plain = replace(
+        system,
+        groups=tuple(
+            replace(group, columns=tuple(column for column in group.columns if column.name in own))
+            for group in system.groups
+        ),
+        experiment=replace(system.experiment, joins=(), leaves=()),
+    )
+    changed = apply(
+        plain,
+        [
+            Override(find(system, group_count(group.name), OVERRIDE, counts=True), Fraction(count))
+            for group, count in zip(system.groups, _counts(system, present), strict=True)
+            if count != group.count
+        ],
+    )
+    return replace(
+        changed,
+        groups=tuple(
+            replace(
+                new,
+                columns=new.columns
+                + tuple(
+                    replace(column, values=column.values[present[starts[old.name] :][: old.count]])
+                    for column in old.columns
+                    if column.name not in own
+                ),
+            )
+            for old, new in zip(system.groups, changed.groups, strict=True)
+        ),
+    )
+
+
+def _fault(
+    system: Model, key: str, item: PeerTime, subject: str, expected: str, got: str = "", fix: str = ""
+) -> ApcError:
+    """Return the error E914 of a join or leave, at its location."""
+    return fault("E914", location_of(system, key, item), subject, expected, got or _s(item.at), fix)
+
+
+def _written(key: str, item: PeerTime, at: str) -> str:
+    """Return a join or leave with another instant as the user writes it."""
+    return f'"{item.peer}": {at}' if item.line else f'--{key} "{item.peer}={at}"'
+
+
+def _s(seconds: Fraction) -> str:
+    """Return an instant as text."""
+    return f"{float(seconds):.9g} s"

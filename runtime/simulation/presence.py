@@ -1,0 +1,70 @@
+"""The peers that are present at each instant of a simulation.
+
+Takes: the first and the last instant of each peer; a model.
+Gives: `Presence`, `first_peers`; `refuse_joins_and_leaves`, `location_of`.
+Guarantees: a peer is present from its join until just before its leave.
+Does not: read or check the instants (see the extension `changing_counts`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apc.compiler.compiled import Model, PeerTime
+from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
+from apc.simulation.signals import Signal
+
+Integers = NDArray[np.int64]
+Flags = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Presence:
+    """The instants in quanta from which (`joins`) and until which (`leaves`) each peer is present, (N,).
+
+    `first_peers` is the index of the first peer of each group.
+    """
+
+    joins: Integers
+    leaves: Integers
+    first_peers: dict[str, int]
+
+    def at(self, instants: Integers) -> Flags:
+        """Return which peers are present at some instants (n, N)."""
+        return (self.joins <= instants[:, None]) & (instants[:, None] < self.leaves)
+
+    def changes(self, last: int) -> Integers:
+        """Return the instants after time 0 and until `last` at which peers join or leave, in rising order."""
+        instants = np.unique([*self.joins, *self.leaves])
+        return instants[(instants > 0) & (instants <= last)]
+
+    def of(self, signals: Sequence[Signal], instants: Integers) -> Flags:
+        """Return whether the peers of some signals are present at some instants (n, signals)."""
+        peers = [self.first_peers[signal.group] + signal.peer - 1 for signal in signals]
+        return self.at(instants)[:, peers]
+
+
+def first_peers(system: Model) -> dict[str, int]:
+    """Return the index of the first peer of each group."""
+    starts = np.cumsum([0, *(group.count for group in system.groups)]).tolist()
+    return {group.name: start for group, start in zip(system.groups, starts, strict=False)}
+
+
+def location_of(system: Model, key: str, item: PeerTime) -> SourceLocation:
+    """Return the location of a join or leave (`key`): in the topology, or the option."""
+    if item.line:
+        return SourceLocation(system.origin.topology, item.line, item.column)
+    return SourceLocation(f"--{key}")
+
+
+def refuse_joins_and_leaves(system: Model, command: str) -> None:
+    """Raise E914 if the experiment of a model has joins or leaves, which a command does not support."""
+    for key, items in (("joins", system.experiment.joins), ("leaves", system.experiment.leaves)):
+        if items:
+            location = location_of(system, key, items[0])
+            message = f"{key} are not available in {command}"
+            raise ApcError(Diagnostic("E914", location, message, advice=f"remove {key}, or use apc simulate"))
