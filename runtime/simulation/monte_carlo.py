@@ -104,7 +104,7 @@ class MeanSquare:
 class Ensemble(Result):
     """The results of the runs of a model, in order; `interrupted` states that runs are missing.
 
-    `mean_square` is None if no packet is lost or late.
+    `mean_square` is None if no packet is lost or late, or if peers join or leave.
     """
 
     shown_by = "simulation_output:ensemble"
@@ -219,7 +219,8 @@ def simulate_many(
             raise
         interrupted = True
     finished.sort(key=lambda run: run.number)
-    mean_square = None if interrupted else _mean_square(system)
+    changing = system.experiment.joins or system.experiment.leaves
+    mean_square = None if interrupted or changing else _mean_square(system)
     return Ensemble(system.name, settings.duration, seed, tuple(finished), interrupted, mean_square)
 
 

@@ -9,7 +9,7 @@ Does not: run it (see `output_blocks`).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import partial
@@ -34,6 +34,7 @@ from apc.simulation.forcing import SubsystemForcing, subsystem_forcing
 from apc.simulation.interpreted_engine import InterpretedEngine
 from apc.simulation.pairwise import count_pairs
 from apc.simulation.population import (
+    DeliverySource,
     FrameEngine,
     Population,
     build_population,
@@ -128,14 +129,17 @@ class Simulation:
         """An upper bound on the number of rows: that of complete frames."""
         return (int(self.settings.duration / self.quantum) // self.frame + 1) * len(self.sample_times)
 
-    def player(self) -> FrameEngine:
-        """Return a new engine for this simulation, with its own memory."""
+    def player(self, deliveries: Callable[[int], DeliverySource] | None = None) -> FrameEngine:
+        """Return a new engine for this simulation, with its own memory.
+
+        `deliveries` gives the packets of a run over unreliable links; by default a `Timetable`.
+        """
         if self.presence is not None:
             engine: FrameEngine = require_extension("changing_counts").changing_engine(self)
             return engine
         routes = self.population.exchange_program.routes
         timetable = partial(Timetable, routes, self.arrival_processes, seed=self.seed)
-        packets = (lambda run: timetable(run=run)) if routes else None
+        packets = deliveries or ((lambda run: timetable(run=run)) if routes else None)
         if self.library is not None:
             return CompiledEngine(self.library, self.population, packets)
         return InterpretedEngine(self.population, packets)

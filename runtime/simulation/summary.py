@@ -355,7 +355,8 @@ class SummaryAccumulator:
 
 def _first_finite(values: Floats) -> Floats:
     """Return the first finite value of each column (rows, n), NaN where there is none."""
-    return values[np.isfinite(values).argmax(axis=0), np.arange(values.shape[1])]
+    rows: Floats = values[np.isfinite(values).argmax(axis=0), np.arange(values.shape[1])]
+    return rows
 
 
 def _limits(system: Model, signals: Sequence[Signal]) -> list[tuple[int, str, float]]:

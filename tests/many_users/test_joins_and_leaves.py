@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from fractions import Fraction
 from itertools import pairwise
 from pathlib import Path
 
@@ -11,6 +12,9 @@ import pytest
 from numpy.typing import NDArray
 
 import apc
+from apc.network.packet_schedule import Timetable
+from apc.simulation.settings import Settings
+from apc.simulation.simulation import prepare
 from tests.bruteforce import TopologySource, frame_matrix
 from tests.commands import Cli
 from tests.hidden import hidden
@@ -241,11 +245,27 @@ def test_bad_joins_and_leaves_are_refused(options: str, cli: Cli, tmp_path: Path
     assert re.search(BAD[options], " ".join(ran.err.split())), ran.err
 
 
-def test_links_without_constant_delays_refuse_joins(cli: Cli) -> None:
-    ran = cli(
-        "simulate", str(TOPOLOGIES / "lossy-average.yaml"), "--duration", "1 s", "--leaves", "user[1]=80 ms"
+BAD_LINKS = {
+    "delay: 8 ms, graph: ring": None,
+    "delay: 8 ms, loss: 5 %": None,
+    "delay: 8 ms, loss: 5 %, graph: ring": "graph of lan .*: expected complete, got ring. Try: graph",
+    "delay: 8 ms, graph: {edges: [[1, 2], [2, 3], [3, 4], [4, 1]]}": "graph of lan .* or ring, got a list",
+    "delay: 8 ms, graph: star": "graph of lan .*: expected complete or ring, got star",
+    "delay: 8 ms, loss: 5 %, on_loss: zero": "on_loss of lan .*: expected hold, got zero. Try: on_loss: hold",
+    "delay: 8 ms, jitter: 9 ms, reorder: all": "reorder of lan .*: expected newest, got all",
+}
+
+
+@pytest.mark.parametrize("link", BAD_LINKS)
+def test_links_that_refuse_leaves(link: str, tmp_path: Path, cli: Cli) -> None:
+    path, text = tmp_path / "topology.yaml", AVERAGE.read_text(encoding="utf-8")
+    path.write_text(
+        text.replace("delay: 8 ms}", link + "}").replace("count: 3", "count: 4"), encoding="utf-8"
     )
-    assert ran.code == 1 and "E914" in ran.err and "at random" in " ".join(ran.err.split())
+    ran = cli("simulate", str(path), "--duration", "0.2 s", "--leaves", "user[1]=80 ms")
+    expected = BAD_LINKS[link]
+    assert ran.code == (expected is not None)
+    assert expected is None or re.search(f"E914 {expected}", " ".join(ran.err.split())), ran.err
 
 
 def test_without_the_extension_joins_are_refused_by_name(cli: Cli) -> None:
@@ -293,3 +313,88 @@ def test_nonlinear_motion_and_planar_bodies_join(tmp_path: Path) -> None:
     assert shared
     for name in shared:
         assert planar[f"user[3].{name}"][at] == pytest.approx(means[name], rel=1e-12, abs=1e-18)
+
+
+LOSSY = """
+topology: lossy
+clocks: {haptic: 1 ms, network: 8 ms}
+peers:
+  user: {set: {cube.x: [1 mm, -2 mm, 0 mm, 0 mm]}}
+masses: {cube: {mass: 0.8 kg, damping: 2 N*s/m, shared: true}}
+couplers: {coordination: {type: AveragePosition, object: cube, stiffness: 100 N/m, clock: haptic, link: lan}}
+links: {lan: {clock: network, delay: 8 ms, loss: 40 %}}
+experiment:
+  duration: 0.4 s
+  seed: 7
+  joins: {"user[3]": 80 ms, "user[4]": 160 ms}
+  leaves: {"user[1]": 240 ms}
+"""
+
+
+def lossy_by_hand(arrived: dict[tuple[int, int], set[int]]) -> Floats:
+    """Return the positions (401, 4) of the peers of LOSSY; `arrived` are the packets on each link."""
+    joins, leaves = {1: 0, 2: 0, 3: 80, 4: 160}, {1: 240}
+    x, v = {1: 1e-3, 2: -2e-3}, {1: 0.0, 2: 0.0}
+    held, sent, rows = {(1, 2): 1e-3, (2, 1): -2e-3}, dict[tuple[int, int], float](), []
+    for now in range(401):
+        for peer in [peer for peer, at in leaves.items() if at == now]:
+            del x[peer], v[peer]
+        for peer in [peer for peer, at in joins.items() if at == now > 0]:
+            held |= {(other, peer): x[other] for other in x}
+            x[peer], v[peer] = np.mean([*x.values()]), np.mean([*v.values()])
+            held |= {(peer, other): x[peer] for other in x if other != peer}
+        rows.append([x.get(peer, np.nan) for peer in joins])
+        for sender, receiver in held:
+            number = now // 8 - 1
+            first = max(joins[sender], joins[receiver]) // 8
+            if now % 8 == 0 and number >= first and number in arrived[sender, receiver] and sender in x:
+                held[sender, receiver] = sent[sender, number]
+        if now % 8 == 0:
+            sent |= {(peer, now // 8): x[peer] for peer in x}
+        mass, damping = 0.8 / len(x), 2.0
+        decay = np.exp(-damping / mass * 1e-3)
+        rise = mass * (1 - decay) / damping
+        for peer in x:
+            force = -100 * (x[peer] - np.mean([held[other, peer] for other in x if other != peer]))
+            steady = force / damping
+            x[peer], v[peer] = (
+                x[peer] + rise * v[peer] + steady * (1e-3 - rise),
+                decay * v[peer] + (1 - decay) * steady,
+            )
+    return np.array(rows)
+
+
+@pytest.mark.parametrize("jit", [True, False])
+def test_joins_over_a_lossy_link_agree_with_a_simulation_by_hand(tmp_path: Path, jit: bool) -> None:
+    path = tmp_path / "lossy.yaml"
+    path.write_text(LOSSY, encoding="utf-8")
+    run = apc.simulate(path, jit=jit)
+    # The losses of all peers.
+    everyone = prepare(apc.compile(path), Settings(Fraction(4, 10), jit=jit))
+    routes = everyone.population.exchange_program.routes
+    [delivered] = Timetable(routes, everyone.arrival_processes, seed=7).take(51 * everyone.frame)
+    arrived = {
+        (sender + 1, receiver + 1): set(delivered.packets[:, index].tolist())
+        for index, (sender, receiver) in enumerate(routes[0].pairs.tolist())
+    }
+    assert 0 < sum(map(len, arrived.values())) / len(arrived) < 40
+    expected = lossy_by_hand(arrived)
+    for peer in range(1, 5):
+        np.testing.assert_allclose(run[f"user[{peer}].cube.x"], expected[:, peer - 1], rtol=0, atol=1e-15)
+
+
+def test_many_runs_with_joins(cli: Cli) -> None:
+    path = TOPOLOGIES / "lossy-average.yaml"
+    ran = cli(
+        "simulate",
+        str(path),
+        "--duration",
+        "1 s",
+        "--joins",
+        "user[3]=0.4 s",
+        "--runs",
+        "5",
+        "--impulse",
+        "user[1]",
+    )
+    assert ran.code == 0 and "5 runs of 1 s" in ran.out and "Verdict" not in ran.out

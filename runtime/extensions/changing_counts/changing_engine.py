@@ -1,7 +1,7 @@
 """An engine for peers that join and leave: one simulation for each set of present peers.
 
 Takes: a `Simulation` with its `Presence`.
-Gives: `changing_engine`.
+Gives: `changing_engine`, `ChangingEngine`; `PresentPeers`, `PresentDeliveries`.
 Guarantees: between changes the motion is exactly that of a model of the present peers alone. The rows of
 absent peers are NaN.
 Does not: read the instants (see `peer_times`).
@@ -14,20 +14,27 @@ At the start of the frame of a change, in this order:
 3. The packets of a peer that joins are, at each instant of sending, the mean m of the packets of the peers of
    its group that stay, shifted to its own values: m + s(own values) − mean of s(values of the others), where
    s gives the sent values. If all its sent values are means, so are its packets.
+4. Over an unreliable link, packets sent before the join of their sender or receiver do not arrive. Until the
+   first packet the receiver holds the sender's values at the join. A directed link has the same losses and
+   delays as if all peers were always present.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import PeerType
-from apc.extensions.changing_counts.peer_times import model_of_present
+from apc.extensions.changing_counts.peer_times import counts_of, model_of_present
+from apc.network.packet_schedule import START, DeliveredPackets, Timetable
+from apc.simulation.compiled_engine import CompiledEngine
+from apc.simulation.interpreted_engine import InterpretedEngine
 from apc.simulation.output_blocks import forces_in_time
-from apc.simulation.population import FrameEngine, FrameRows, PopulationState
+from apc.simulation.population import DeliverySource, FrameRows
 from apc.simulation.program import GroupProgram
 from apc.simulation.simulation import Simulation, prepare
 
@@ -41,34 +48,52 @@ class PresentPeers:
     """The simulation of the present peers (`present`, (N,)), with its engine.
 
     `sources` are the columns of its rows that are recorded in the columns `targets` of all peers' rows.
+    `links` are the indices of its directed links among those of all peers, for each unreliable route.
     """
 
     present: Flags
     simulation: Simulation
-    engine: FrameEngine
+    engine: CompiledEngine | InterpretedEngine
     sources: Integers
     targets: Integers
-
-    @property
-    def state(self) -> PopulationState:
-        """The stored values of the engine."""
-        assert isinstance(self.engine, PopulationState)
-        return self.engine
+    links: tuple[Integers, ...]
 
     def indices(self, group: int, peers: Flags) -> Integers:
         """Return the indices of some peers (N,) among the present peers of a group."""
         first = np.cumsum([0, *(model_group.count for model_group in self.simulation.system.groups)])
-        position = np.cumsum(self.present) - 1
-        of_group = position[peers & self.present]
-        return of_group[(first[group] <= of_group) & (of_group < first[group + 1])] - first[group]
+        chosen = peers[self.present][first[group] : first[group + 1]]
+        return np.flatnonzero(chosen)
 
 
-def changing_engine(simulation: Simulation) -> FrameEngine:
+@dataclass(frozen=True, slots=True)
+class PresentDeliveries:
+    """The packets in effect on the directed links of the present peers.
+
+    `source` are the packets of all peers, `links` as in `PresentPeers`; `first` are the numbers of the first
+    packets that can arrive, on each directed link of all peers.
+    """
+
+    source: DeliverySource
+    links: tuple[Integers, ...]
+    first: tuple[Integers, ...]
+
+    def take(self, until: int) -> tuple[DeliveredPackets, ...]:
+        """Return the packets in effect at the ticks before an instant (see `DeliverySource`)."""
+        result = []
+        for delivered, links, first in zip(self.source.take(until), self.links, self.first, strict=True):
+            packets = delivered.packets[:, links]
+            early = packets < first[links]
+            missing = delivered.missing[:, links] & ~early
+            result.append(DeliveredPackets(np.ascontiguousarray(np.where(early, START, packets)), missing))
+        return tuple(result)
+
+
+def changing_engine(simulation: Simulation) -> ChangingEngine:
     """Return an engine of a simulation in which peers join and leave."""
-    return _ChangingEngine(simulation)
+    return ChangingEngine(simulation)
 
 
-class _ChangingEngine:
+class ChangingEngine:
     """An engine that passes from one set of present peers to the next."""
 
     def __init__(self, simulation: Simulation) -> None:
@@ -76,17 +101,27 @@ class _ChangingEngine:
         self.simulation, self.presence = simulation, simulation.presence
         last = int(simulation.settings.duration / simulation.quantum)
         self.changes = (self.presence.changes(last) // simulation.frame).tolist()
+        self.simulations: dict[object, Simulation] = {}
         self.prepared: dict[bytes, PresentPeers] = {}
+        self.routes = simulation.population.exchange_program.routes
+        self.first = tuple(
+            self.presence.joins[route.pairs].max(axis=1) // simulation.frame * route.slots
+            for route in self.routes
+        )
         self.begin(0)
+        for frame in self.changes:  # errors of all numbers of peers are found before the first row
+            self._present_at(frame)
 
     def begin(self, run: int) -> None:
-        """Reset all peers to time 0 of a run (see `FrameEngine`)."""
+        """Reset all peers to time 0 of a run (see `population.FrameEngine`)."""
         self.run, self.work_of_absent = run, np.zeros(len(self.simulation.population.parts))
+        seed = self.simulation.seed
+        self.source = Timetable(self.routes, self.simulation.arrival_processes, seed=seed, run=run)
         self.now = self._present_at(0)
         self.now.engine.begin(run)
 
     def advance(self, first: int, count: int, pushes: Sequence[Floats | None]) -> FrameRows:
-        """Simulate the frames from number `first` on (see `FrameEngine`); forces are computed here."""
+        """Simulate the frames from number `first` on (see `population.FrameEngine`)."""
         population = self.simulation.population
         rows = np.full((count, population.sample_count, population.width), np.nan)
         work = np.zeros((count, len(population.parts)))
@@ -120,16 +155,14 @@ class _ChangingEngine:
         return self.prepared[key]
 
     def _prepare(self, present: Flags) -> PresentPeers:
-        """Return the simulation of some peers, with the signals of all their groups' recorded signals."""
-        base = self.simulation
-        patterns = dict.fromkeys(f"{signal.group}.{signal.local}" for signal in base.signals)
-        model = model_of_present(base.topology, present)
-        simulation = prepare(model, base.settings, signals=tuple(patterns))
-        assert len(simulation.population.members) == len(model.groups), "all peers of a group are recorded"
-        starts, column_of = self.presence.first_peers, {}
-        for signal, column in zip(base.signals, base.order.tolist(), strict=True):
-            column_of[signal.group, starts[signal.group] + signal.peer - 1, signal.local] = column
-        peers, counts = np.flatnonzero(present), [group.count for group in model.groups]
+        """Return the present peers with their simulation, an engine, and the indices of signals and links."""
+        base, starts = self.simulation, self.presence.first_peers
+        simulation = self._simulation(present)
+        column_of = {
+            (signal.group, starts[signal.group] + signal.peer - 1, signal.local): column
+            for signal, column in zip(base.signals, base.order.tolist(), strict=True)
+        }
+        peers, counts = np.flatnonzero(present), [group.count for group in simulation.system.groups]
         first = dict(zip(starts, np.cumsum([0, *counts]).tolist(), strict=False))
         pairs = [
             (source, column_of[key])
@@ -138,21 +171,48 @@ class _ChangingEngine:
             in column_of
         ]
         sources, targets = np.array(pairs, np.int64).reshape(-1, 2).T
-        return PresentPeers(present, simulation, simulation.player(), sources, targets)
+        routes = zip(simulation.population.exchange_program.routes, self.routes, strict=True)
+        links = tuple(_indices(peers[route.pairs], all_links.pairs) for route, all_links in routes)
+        deliveries = partial(self._deliveries, links) if links else None
+        engine = simulation.player(deliveries)
+        assert isinstance(engine, (CompiledEngine, InterpretedEngine))
+        return PresentPeers(present, simulation, engine, sources, targets, links)
+
+    def _simulation(self, present: Flags) -> Simulation:
+        """Return the simulation of some peers, with all signals that are recorded of any peer of a group.
+
+        Without values of single peers it is that of any as many peers.
+        """
+        base, counts = self.simulation, counts_of(self.simulation.topology, present)
+        own = any(group.columns for group in base.topology.groups)
+        key = present.tobytes() if own else tuple(counts)
+        if key not in self.simulations:
+            patterns = dict.fromkeys(f"{signal.group}.{signal.local}" for signal in base.signals)
+            model = model_of_present(base.topology, present)
+            self.simulations[key] = simulation = prepare(model, base.settings, signals=tuple(patterns))
+            assert len(simulation.population.members) == len(counts), "all peers of a group are recorded"
+        return self.simulations[key]
+
+    def _deliveries(self, links: tuple[Integers, ...], _: int) -> PresentDeliveries:
+        """Return the packets on the directed links of present peers in the present run."""
+        return PresentDeliveries(self.source, links, self.first)
 
     def _change(self, frame: int) -> None:
         """Pass to the peers that are present from a frame on."""
         old, new = self.now, self._present_at(frame)
-        members = list(zip(old.simulation.population.members, old.state.carries, strict=True))
+        members = list(zip(old.simulation.population.members, old.engine.carries, strict=True))
         for group, (member, carry) in enumerate(members):
             layout, leaving = member.program.layout, old.indices(group, ~new.present)
             parts = [self.simulation.population.parts.index(part) for part in layout.parts]
             np.add.at(self.work_of_absent, parts, carry[layout.work][:, leaving].sum(axis=1))
         carries, packets = _changed(old, new, frame)
+        received = [_received(old, new, route, carries, frame) for route in range(len(self.routes))]
         new.engine.begin(self.run)
-        for array, values in zip(new.state.carries, carries, strict=True):
+        for array, values in zip(new.engine.carries, carries, strict=True):
             array[:] = values
-        new.state.packets[:] = packets
+        new.engine.packets[:] = packets
+        for route, (held, effective) in enumerate(received):
+            new.engine.held[route][:], new.engine.effective[route][:] = held, effective
         self.now = new
 
 
@@ -161,28 +221,53 @@ def _changed(old: PresentPeers, new: PresentPeers, frame: int) -> tuple[list[Flo
     stay, join = old.present & new.present, new.present & ~old.present
     before, after = old.simulation.population, new.simulation.population
     means = _state_means(old, stay)
-    packets = np.empty(new.state.packets.shape)
+    packets = np.empty(new.engine.packets.shape)
     carries, column, old_column = [], 0, 0
     for group, member in enumerate(after.members):
         staying, old_staying = new.indices(group, stay), old.indices(group, stay)
-        joining, old_carry = new.indices(group, join), old.state.carries[group]
+        joining, old_carry = new.indices(group, join), old.engine.carries[group]
         carry = member.each(member.carry).T.copy()
         carry[:, staying] = old_carry[:, old_staying]
         columns = slice(column, column + member.count)
         own = packets[:, :, columns]
-        own[:, :, staying] = old.state.packets[:, :, old_column + old_staying]
+        own[:, :, staying] = old.engine.packets[:, :, old_column + old_staying]
         if len(joining):
             _set_joining_values(member, carry, joining, staying, means)
             seconds = float(frame * after.frame * after.quantum)
-            mean_packets = own[:, :, staying].mean(axis=2) if len(staying) else 0.0
             for key, sent in enumerate(after.exchange_program.keys):
                 values = _sent(member, carry, sent.link, sent.channel, seconds)
-                mean_value = values[staying].mean() if len(staying) else 0.0
-                history = mean_packets[:, key] if len(staying) else np.zeros(len(packets))
-                own[:, key, joining] = history[:, None] + (values[joining] - mean_value)
+                history = own[:, key, staying] - values[staying]
+                mean = history.mean(axis=1) if len(staying) else np.zeros(len(packets))
+                own[:, key, joining] = mean[:, None] + values[joining]
         carries.append(carry)
         column, old_column = column + member.count, old_column + before.members[group].count
     return carries, packets
+
+
+def _received(
+    old: PresentPeers, new: PresentPeers, route: int, carries: Sequence[Floats], frame: int
+) -> tuple[Floats, Integers]:
+    """Return the held values and the packets in effect on the directed links of a route after a change."""
+    population = new.simulation.population
+    program, pairs = population.exchange_program, population.exchange_program.routes[route].pairs
+    seconds = float(frame * population.frame * population.quantum)
+    held = np.zeros(new.engine.held[route].shape)
+    for row, keys in enumerate(program.channels[route]):
+        sent = program.keys[keys[0]]
+        members = zip(population.members, carries, strict=True)
+        values = [_sent(member, carry, sent.link, sent.channel, seconds) for member, carry in members]
+        held[row] = np.concatenate(values)[pairs[:, 0]]
+    effective = np.full(len(pairs), START, np.int64)
+    _, before, after = np.intersect1d(old.links[route], new.links[route], return_indices=True)
+    held[:, after] = old.engine.held[route][:, before]
+    effective[after] = old.engine.effective[route][before]
+    return held, effective
+
+
+def _indices(pairs: Integers, all_pairs: Integers) -> Integers:
+    """Return the index of each (sender, receiver) pair in a list of pairs that contains it."""
+    index_of = {pair: index for index, pair in enumerate(map(tuple, all_pairs.tolist()))}
+    return np.array([index_of[sender, receiver] for sender, receiver in pairs.tolist()], np.int64)
 
 
 def _state_means(old: PresentPeers, stay: Flags) -> dict[str, float]:
@@ -191,7 +276,7 @@ def _state_means(old: PresentPeers, stay: Flags) -> dict[str, float]:
     for group, member in enumerate(old.simulation.population.members):
         staying = old.indices(group, stay)
         for row, state in enumerate(member.program.peer_type.states):
-            values.setdefault(state.name, []).append(old.state.carries[group][row, staying])
+            values.setdefault(state.name, []).append(old.engine.carries[group][row, staying])
     joined = {name: np.concatenate(arrays) for name, arrays in values.items()}
     return {name: float(array.mean()) for name, array in joined.items() if len(array)}
 
@@ -231,5 +316,6 @@ def _sent(member: GroupProgram, carry: Floats, link: str, channel: str, seconds:
             function = send.send.map(member.count)
             parameters = member.each(member.parameters).T
             values = function(carry[: layout.states], carry[layout.held], parameters, seconds)
-            return np.asarray(values, np.float64)[send.channels.index(channel)]
+            sent: Floats = np.asarray(values, np.float64)[send.channels.index(channel)]
+            return sent
     return np.zeros(member.count)

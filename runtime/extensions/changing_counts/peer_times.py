@@ -1,7 +1,7 @@
 """The instants at which peers join and leave a simulation.
 
 Takes: texts of options; the joins and leaves of a model's experiment.
-Gives: `with_peer_times`, `presence_of`, `model_of_present`.
+Gives: `with_peer_times`, `presence_of`, `counts_of`, `model_of_present`.
 Guarantees: all invalid instants are reported together (E914). Peers join and leave at the starts of frames.
 Does not: simulate (see `changing_engine`).
 """
@@ -21,8 +21,8 @@ from apc.compiler.errors import ApcError, Mistakes, SourceLocation
 from apc.compiler.language.units import quantity
 from apc.compiler.peer_counts import least_peers
 from apc.compiler.source.reading import fault
-from apc.parameter_values.overrides import OVERRIDE, Override, apply
-from apc.parameter_values.parameter_names import find
+from apc.parameter_values.overrides import Override, apply
+from apc.parameter_values.parameter_names import OVERRIDE, find
 from apc.simulation.presence import Presence, first_peers, location_of
 from apc.timing.schedule import Schedule
 
@@ -102,7 +102,6 @@ def presence_of(system: Model, schedule: Schedule, duration: Fraction) -> Presen
     joins = np.zeros(system.peers, np.int64)
     leaves = np.full(system.peers, NEVER)
     first, last_of = first_peers(system), dict[tuple[str, int], PeerTime]()
-    _check_links(system, mistakes)
     for key, array in (("joins", joins), ("leaves", leaves)):
         for item in getattr(system.experiment, key):
             with mistakes:
@@ -115,25 +114,33 @@ def presence_of(system: Model, schedule: Schedule, duration: Fraction) -> Presen
                 array[peer] = int(item.at / schedule.quantum)
                 if key == "leaves" and item.at <= (join := joins[peer] * schedule.quantum):
                     raise _fault(system, key, item, f"leave of {name}", f"after its join at {_s(join)}")
-    mistakes.raise_if_any()
     presence = Presence(joins, leaves, first)
+    _check_links(system, presence, mistakes)
+    mistakes.raise_if_any()
     changes = presence.changes(int(duration / schedule.quantum))
     for instant, present in zip([0, *changes.tolist()], presence.at(np.append(0, changes)), strict=True):
         _check_counts(system, present, instant * schedule.quantum)
     return presence
 
 
-def _check_links(system: Model, mistakes: Mistakes) -> None:
+def _check_links(system: Model, presence: Presence, mistakes: Mistakes) -> None:
     """Record each link that does not allow joins and leaves."""
     key = "joins" if system.experiment.joins else "leaves"
     location = location_of(system, key, getattr(system.experiment, key)[0])
+    constant_hub = bool(presence.joins[0] == 0 and presence.leaves[0] == NEVER)
     for link in system.links:
-        if link.graph.shape == "arcs":
-            message = f"the graph of {link.name} lists peers by number, so that no peer can join or leave"
-            mistakes.add("E914", location, message, fix="graph: complete")
+        graphs = ["complete", *["star"] * constant_hub, *["ring"] * (link.channel is None)]
+        permitted = [("graph", link.graph.shape, graphs)]
         if link.channel is not None:
-            message = f"peers can't join or leave over {link.name}, which loses or delays packets at random"
-            mistakes.add("E914", location, message, advice="remove loss, jitter and trace of the link")
+            permitted += [("on_loss", link.channel.on_loss, ["hold"])]
+            permitted += [("reorder", link.channel.reorder, ["newest"])]
+        for word, value, allowed in permitted:
+            if value not in allowed:
+                subject, got = f"{word} of {link.name} with joins or leaves", value.replace("arcs", "a list")
+                expected = " or ".join(allowed)
+                mistakes.add(
+                    "E914", location, subject, expected=expected, got=got, fix=f"{word}: {allowed[0]}"
+                )
 
 
 def _peer_of(system: Model, key: str, item: PeerTime) -> tuple[Group, int]:
@@ -166,7 +173,7 @@ def _check_time(system: Model, key: str, item: PeerTime, duration: Fraction, fra
 
 def _check_counts(system: Model, present: Flags, at: Fraction) -> None:
     """Raise E914 if a group has no present peer from an instant on, or all groups too few."""
-    counts = _counts(system, present)
+    counts = counts_of(system, present)
     for group, count in zip(system.groups, counts, strict=True):
         least = max(1, least_peers(system.peer_types) - sum(counts) + count)
         if count < least:
@@ -176,10 +183,11 @@ def _check_counts(system: Model, present: Flags, at: Fraction) -> None:
             raise _fault(system, key, item, subject, f"at least {least}", str(count))
 
 
-def _counts(system: Model, present: Flags) -> list[int]:
+def counts_of(system: Model, present: Flags) -> list[int]:
     """Return the number of present peers of each group."""
     starts = [*first_peers(system).values()]
-    return np.add.reduceat(present.astype(np.int64), starts).tolist()
+    counts: list[int] = np.add.reduceat(present.astype(np.int64), starts).tolist()
+    return counts
 
 
 def model_of_present(system: Model, present: Flags) -> Model:
@@ -201,7 +209,7 @@ def model_of_present(system: Model, present: Flags) -> Model:
         plain,
         [
             Override(find(system, group_count(group.name), OVERRIDE, counts=True), Fraction(count))
-            for group, count in zip(system.groups, _counts(system, present), strict=True)
+            for group, count in zip(system.groups, counts_of(system, present), strict=True)
             if count != group.count
         ],
     )
