@@ -332,7 +332,7 @@ class PeerType:
     arcs: different sums have different floats. `hands` are the parts in the section `hands`
     whose force depends on their motion; `held` are the parts that a hand is connected to, or without hands
     the parts with a connector for hands. `joining` are the parts whose values at a joining peer are the mean
-    of the other peers': shared objects, and the parts that send. `linear` is the peer type in a linear
+    of the other peers'. `linear` is the peer type in a linear
     analysis, with the same states and parameters, None if it is the same; `replaced` are the parts with other
     equations there. `symbols` are the symbols of published wall conditions with their parameters or numbers,
     empty unless every part except hands has symbols.
@@ -353,6 +353,10 @@ class PeerType:
     replaced: tuple[Replaced, ...] = ()
     symbols: tuple[tuple[str, str], ...] = ()
     joining: tuple[str, ...] = ()
+
+    def joins_at_mean(self, name: str) -> bool:
+        """Return whether a value such as "cube.x" of a joining peer is the mean of the other peers'."""
+        return any(name.startswith(f"{part}.") for part in self.joining)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

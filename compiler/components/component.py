@@ -38,7 +38,8 @@ Joined = tuple[
 OTHERS = "others"
 # Reserved words of the language, invalid as names.
 RESERVED = frozenset(
-    {"peers", "others", "time", "pi", "ground", "type", "at", "shared", "set", *FUNCTIONS, *KEYWORDS}
+    {"peers", "others", "time", "pi", "ground", "type", "at", "shared", "joining", "set"}
+    | {*FUNCTIONS, *KEYWORDS}
 )
 # Symbols of published conditions on virtual walls: stiffness and damping of the wall, damping and Coulomb
 # friction of the device, sampling period, delay of the loop, resolution of the position.
@@ -187,7 +188,7 @@ class Component:
     `locals` are undeclared names on the left side of an equation; they have the dimension of the right side.
     `passed` are the connectors that belong to an inner part: (connector, inner part, its connector). `grips`
     are the connectors that a hand is connected to by default; `peers` is the required number of peers, 0 for
-    any number.
+    any number. `joining` is "mean" or "start": the values of the part at a joining peer, "" if not declared.
     """
 
     name: str
@@ -206,6 +207,7 @@ class Component:
     peers: int = 0
     linearized: Linearized | None = None  # None if the component's own equations are linearized
     symbols: Named[str] = ()  # symbols of published wall conditions, and their parameters
+    joining: str = ""
 
     def parameter(self, name: str) -> Parameter | None:
         """Return the parameter of this name, or None."""

@@ -38,6 +38,7 @@ from apc.compiler.components.parts import (
     EntryScope,
     PartEntries,
     component_named,
+    joining_of,
     read_entry,
 )
 from apc.compiler.errors import Mistakes
@@ -66,7 +67,7 @@ from apc.compiler.wording import counted
 CONNECTOR = ("connector", "description", "source", "potentials", "flows")
 COMPONENT = (
     *("component", "description", "source", "peers", "extends", "connectors", "parameters", "variables"),
-    *("parts", "connect", "sends", "equations", "linearized", "symbols"),
+    *("parts", "connect", "sends", "equations", "linearized", "symbols", "joining"),
 )
 DEEPEST = 10  # levels of parts inside parts
 
@@ -167,6 +168,7 @@ def _read_declarations(root: MappingReader, library: Definitions, mistakes: Mist
         location=title.location,
         grips=(*base.grips, *(connector for connector, _, for_hands in connectors if for_hands)),
         peers=root.read("peers", _required_peers, base.peers),
+        joining=root.read("joining", joining_of, base.joining),
     )
     _check_limits(draft.variables, draft.numbers, mistakes)
     return _with_inner_parts(root, draft, library, mistakes)

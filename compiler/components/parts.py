@@ -1,7 +1,8 @@
 """The entries of parts, in a topology or inside a component, checked against their components.
 
 Takes: YAML mappings, the components, and the enclosing scope. Gives: `PartEntry`, `PartEntries`,
-`EntryScope`; `read_entry`, the `PartBindings` of an entry; `Definitions`, `component_named`.
+`EntryScope`; `read_entry`, the `PartBindings` of an entry; `Definitions`, `component_named`,
+`joining_of`.
 Guarantees: every number, option, reference and connection required by a component exists, or one error
 reports that it is missing.
 Does not: handle the sections of a topology.
@@ -73,8 +74,10 @@ MOST_PARTS = 1000
 PART_KEYS = (
     "at",
     "shared",
+    "joining",
     "count",
 )
+JOINING = ("mean", "start")  # the values of a part at a joining peer
 # By section: the name of an example part, its entry, and the type proposed for an entry without a type.
 EXAMPLES = {
     "masses": ("device", "{mass: 0.1 kg}", "Mass"),
@@ -725,3 +728,11 @@ def _matching_connector(
 def _single(unit: Unit) -> str:
     """Return the text of a number in a unit, as an example in messages."""
     return f"1 {unit.text}".removesuffix(" 1")
+
+
+def joining_of(node: Node, subject: str) -> str:
+    """Return the values of a part at a joining peer, from `joining: mean` or `joining: start`."""
+    word = text_of(node, subject, f"{subject}: mean")
+    if word not in JOINING:
+        raise fault("E203", node.location, subject, " or ".join(JOINING), form(node), f"{subject}: mean")
+    return word

@@ -328,7 +328,7 @@ def _peer_type(writer: CasadiWriter, received: Iterable[str], timings: Timings) 
             dict.fromkeys(other for part in hands for _, other, _ in part.connections if other != GROUND)
         )
         or tuple(part.name for part in flat.parts if part.component.grips),
-        joining=tuple(part.name for part in flat.parts if part.shared or part.component.sends),
+        joining=tuple(part.name for part in flat.parts if part.joins_at_mean),
     )
 
 

@@ -25,7 +25,7 @@ from apc.compiler.components.component import (
     Reference,
     Settable,
 )
-from apc.compiler.components.parts import GROUND, MOST_PARTS, EntryScope, PartEntry, read_entry
+from apc.compiler.components.parts import GROUND, MOST_PARTS, EntryScope, PartEntry, joining_of, read_entry
 from apc.compiler.errors import Mistakes, SourceLocation
 from apc.compiler.language.recordings import TimeTable, read_time_table
 from apc.compiler.language.values import PEERS, ScalarValue, ValueBinding, renamed, settle
@@ -47,7 +47,8 @@ class PartInstance:
 
     `values` has a value for every number the component declares, `options` and `references` a word for every
     option and every clock or link, `starts` the start values given in the entry. `connections` connect a
-    connector of this part to (part, connector); the part "ground" is fixed.
+    connector of this part to (part, connector); the part "ground" is fixed. `joining` is "mean" or "start",
+    or "" if the entry does not declare it.
     """
 
     name: str
@@ -62,6 +63,16 @@ class PartInstance:
     shared: bool
     groups: tuple[str, ...]
     location: SourceLocation
+    joining: str = ""
+
+    @property
+    def joins_at_mean(self) -> bool:
+        """Whether the values at a joining peer are the mean of the others'.
+
+        The entry declares it, else the component. By default they are for shared objects and parts that send.
+        """
+        default = "mean" if self.shared or self.component.sends else "start"
+        return (self.joining or self.component.joining or default) == "mean"
 
     @property
     def all_starts(self) -> Named[ScalarValue]:
@@ -119,9 +130,11 @@ class PartReader:
         """
         name, component = entry.name, entry.component
         counts, mistakes = self.numbers.counts, self.numbers.mistakes
-        shared = False
+        shared, joining = False, ""
         with mistakes:
             shared = _shared(entry)
+        with mistakes:
+            joining = _joining(entry)
         roles = [p.name for p in component.parameters if isinstance(p, Reference) and p.role in LINK_ROLES]
         if roles and entry.section != "links":
             message = f"{name} ({component.name}) is valid only in links, not in {entry.section}"
@@ -147,7 +160,9 @@ class PartReader:
             tables = self._tables(entry, dict(read.described))
             bindings = values, read.options, read.references, tables, starts, read.connections
             self._add(
-                PartInstance(element, entry.section, component, *bindings, shared, groups, entry.location)
+                PartInstance(
+                    element, entry.section, component, *bindings, shared, groups, entry.location, joining
+                )
             )
 
     def _add(self, part: PartInstance) -> None:
@@ -241,6 +256,16 @@ def _shared(entry: PartEntry) -> bool:
         message = f"shared: no parameter of {entry.name} ({entry.component.name}) is divided among peers"
         raise fault("E210", node.location, message, advice="remove shared")
     return node.value
+
+
+def _joining(entry: PartEntry) -> str:
+    """Return the values of a part at a joining peer, "" if its entry does not declare them."""
+    if (node := entry.body.get("joining")) is None:
+        return ""
+    if entry.section == "links":
+        message = f"joining has no effect on the link {entry.name}"
+        raise fault("E211", node.location, message, advice="write it at a mass, a coupler or a hand")
+    return joining_of(node, "joining")
 
 
 def _inner_instance(part: PartInstance, inner: Inner, peers: int, mistakes: Mistakes) -> PartInstance:

@@ -41,6 +41,10 @@ def check_command(
         return
     system = compile_topology(path)
     check_values(system)
+    if system.experiment.joins or system.experiment.leaves:
+        from apc.simulation.simulation import check_joins_and_leaves
+
+        check_joins_and_leaves(system)
     echo(f"{path}: no errors ({system.name}, {counted(system.peers, 'peer')})")
     for line in warning_lines((*system.warnings, *replaced_elements(system))):
         echo(line)

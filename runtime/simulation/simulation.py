@@ -1,7 +1,8 @@
 """Preparation of a simulation: all peers, their exchange, recorded signals, and the engine.
 
 Takes: a `Model`, its `Settings`, the signals to record.
-Gives: `SimulationPlan`, `plan_of`; `Simulation`, `prepare`; `check_length`, `size_note`, its expected size.
+Gives: `SimulationPlan`, `plan_of`; `Simulation`, `prepare`; `check_joins_and_leaves`; `check_length`,
+`size_note`, its expected size.
 Guarantees: time is an integer number of quanta. A simulation that would exceed the memory is refused before
 it is built.
 Does not: run it (see `output_blocks`).
@@ -46,7 +47,7 @@ from apc.simulation.presence import Presence
 from apc.simulation.program import GroupProgram, Program, build_member
 from apc.simulation.program_builder import build_program
 from apc.simulation.propagate import perturbed, rates, transition_rows
-from apc.simulation.settings import CVODES, EXACT, WHERE_NEEDED, Method, Settings, check_step
+from apc.simulation.settings import CVODES, DEFAULT, EXACT, WHERE_NEEDED, Method, Settings, check_step
 from apc.simulation.signals import (
     Signal,
     SignalSelection,
@@ -216,6 +217,15 @@ def prepare(
         length=_chunk_length(population, settings.duration),
         presence=presence,
     )
+
+
+def check_joins_and_leaves(system: Model) -> None:
+    """Raise E914 for an invalid join or leave in the experiment of a model, E882 without the extension."""
+    experiment = system.experiment
+    if items := (*experiment.joins, *experiment.leaves):
+        duration = experiment.duration or 1 + max(item.at for item in items)
+        schedule = plan_of(system, DEFAULT).schedules[0]
+        require_extension("changing_counts").presence_of(system, schedule, duration)
 
 
 def check_length(system: Model, duration: Fraction, *, runs: int = 1) -> None:

@@ -27,8 +27,12 @@ AVERAGE, MESH = TOPOLOGIES / "three-users-average.yaml", TOPOLOGIES / "three-use
 FRAME = 0.008
 SIZE = 14  # values of a peer: x, v, x_O, v_O, (contact, own, received) of two ticks, two packets (x_O, v_O)
 STATES = ("device.x", "device.v", "cube.x", "cube.v")
-CONTACT = [4, 7]
-OWN = [0, 1, *CONTACT]  # values that a joining peer does not take from the others
+OWN = [
+    0,
+    1,
+    4,
+    7,
+]  # values of the device and of the contact, which a joining peer does not take from the others
 
 
 def step(operator: str, peers: int) -> Floats:
@@ -36,13 +40,15 @@ def step(operator: str, peers: int) -> Floats:
     return np.array(frame_matrix(TopologySource(operator, peers, kt=500.0, cube=0.6 / peers)))
 
 
-def by_hand(operator: str, start: dict[int, Floats], sets: list[set[int]]) -> list[dict[int, Floats]]:
+def by_hand(
+    operator: str, start: dict[int, Floats], sets: list[set[int]], own: list[int]
+) -> list[dict[int, Floats]]:
     """Return the values of the present peers at the start of each frame, for the peers present in each."""
     peers, steps, result = start, dict[int, Floats](), []
     for present in sets:
         mean = np.mean([values for peer, values in peers.items() if peer in present], axis=0)
         new = mean.copy()
-        new[OWN] = 0.0
+        new[own] = 0.0
         peers = {peer: peers.get(peer, new) for peer in sorted(present)}
         result.append(peers)
         count = len(peers)
@@ -75,10 +81,23 @@ def times(sets: list[set[int]]) -> tuple[dict[str, float], dict[str, float]]:
     return joins, leaves
 
 
+def at_mean(path: Path, tmp_path: Path) -> Path:
+    """Return a topology in which the devices and contacts too join at the mean of the others."""
+    text = path.read_text(encoding="utf-8").replace("device: {", "device: {joining: mean, ")
+    changed = tmp_path / "at-mean.yaml"
+    changed.write_text(text.replace("contact:      {", "contact: {joining: mean, "), encoding="utf-8")
+    return changed
+
+
+@pytest.mark.parametrize("joining", ["mean", "start"])
 @pytest.mark.parametrize("jit", [True, False])
 @pytest.mark.parametrize("operator", ["mean", "sum"])
-def test_a_simulation_agrees_with_all_peers_stepped_by_hand(operator: str, jit: bool) -> None:
+def test_a_simulation_agrees_with_all_peers_stepped_by_hand(
+    operator: str, jit: bool, joining: str, tmp_path: Path
+) -> None:
     """Up to eight changes of up to four present peers, at random."""
+    path = AVERAGE if operator == "mean" else MESH
+    path = at_mean(path, tmp_path) if joining == "mean" else path
     rng = np.random.default_rng(3)
     for _ in range(4):
         sets = random_sets(rng, 8)
@@ -86,7 +105,7 @@ def test_a_simulation_agrees_with_all_peers_stepped_by_hand(operator: str, jit: 
         count = max(map(max, sets))
         start = {1: np.eye(SIZE)[1] * 0.1, 2: np.zeros(SIZE)}
         run = apc.simulate(
-            AVERAGE if operator == "mean" else MESH,
+            path,
             params={"user.count": count},
             duration=len(sets) * FRAME,
             impulse="user[1]",
@@ -94,7 +113,8 @@ def test_a_simulation_agrees_with_all_peers_stepped_by_hand(operator: str, jit: 
             leaves=leaves,
             jit=jit,
         )
-        for frame, peers in enumerate(by_hand(operator, start, sets)):
+        own = OWN if joining == "start" else []
+        for frame, peers in enumerate(by_hand(operator, start, sets, own)):
             for peer in range(1, count + 1):
                 row = [run[f"user[{peer}].{name}"][8 * frame] for name in STATES]
                 expected = peers[peer][:4] if peer in peers else [np.nan] * 4
@@ -134,16 +154,21 @@ def test_the_growing_sequence_grows_at_its_rate(tmp_path: Path) -> None:
     assert growth == pytest.approx(found.growth, rel=2e-3)
 
 
-def test_motions_proved_to_decay_do_so_under_random_changes() -> None:
-    """Two or three users come and go at any frame: proved stable."""
-    assert apc.changing_counts(AVERAGE, "user.count=2:3").verdict == "stable under arbitrary changes"
+@pytest.mark.parametrize("joining", ["mean", "start"])
+def test_motions_proved_to_decay_do_so_under_random_changes(joining: str, tmp_path: Path) -> None:
+    """Two or three users come and go at any frame: proved stable if all values of a new peer are means."""
+    path = at_mean(AVERAGE, tmp_path) if joining == "mean" else AVERAGE
+    found = apc.changing_counts(path, "user.count=2:3")
+    assert found.verdict == "stable under arbitrary changes"
+    assert found.assumed == (() if joining == "mean" else ("device", "contact"))
+    assert ("joining: mean is assumed for device, contact" in str(found)) == (joining == "start")
     rng = np.random.default_rng(5)
     for _ in range(3):
         sets = random_sets(rng, 60, most=3)
         joins, leaves = times(sets)
         count = max(map(max, sets))
         run = apc.simulate(
-            AVERAGE,
+            path,
             params={"user.count": count},
             duration=len(sets) * FRAME,
             signals=["*.v"],
@@ -398,3 +423,29 @@ def test_many_runs_with_joins(cli: Cli) -> None:
         "user[1]",
     )
     assert ran.code == 0 and "5 runs of 1 s" in ran.out and "Verdict" not in ran.out
+
+
+JOINING = """
+component: GroundedMass
+description: A mass that joins at the mean of the others.
+extends: Mass
+joining: mean
+"""
+
+
+@pytest.mark.parametrize(
+    ("entry", "expected"), [("", "mean"), (", joining: start", "start"), (", joining: mean", "mean")]
+)
+def test_a_component_declares_the_values_of_a_joining_peer(entry: str, expected: str, tmp_path: Path) -> None:
+    (tmp_path / "parts").mkdir()
+    (tmp_path / "parts" / "grounded-mass.yaml").write_text(JOINING, encoding="utf-8")
+    text = AVERAGE.read_text(encoding="utf-8").replace("clocks:", "library: ./parts\nclocks:", 1)
+    text = text.replace("device: {", f"device: {{type: GroundedMass{entry}, ")
+    path = tmp_path / "topology.yaml"
+    path.write_text(text, encoding="utf-8")
+    run = apc.simulate(path, duration="0.1 s", impulse="user[1]", joins={"user[3]": "80 ms"})
+    mean = np.mean([run[f"user[{peer}].device.x"][80] for peer in (1, 2)])
+    assert (
+        run["user[3].device.x"][80] == pytest.approx(mean if expected == "mean" else 0.0, rel=1e-12) and mean
+    )
+    assert ("device" in apc.changing_counts(path, "user.count=2:3").assumed) == (expected == "start")

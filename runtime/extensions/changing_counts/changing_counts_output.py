@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from apc.extensions.changing_counts.joins_and_leaves import ChangingCounts, MotionFamily
 
 LEFT_OUT = "packet losses and random delays are left out"
+ASSUMED = "joining: mean is assumed for {}"
 NEAR_START = "nonlinear topology: the result holds near the initial state"
 
 
@@ -25,6 +26,8 @@ def changing_counts_text(result: ChangingCounts) -> Lines:
     verdict = f"unstable with {result.parameter} = {result.sequence[0]}" if alone else result.verdict
     yield f"{result.topology}: {verdict}{'' if alone else ' of the number of peers'}"
     notes = [NEAR_START] * result.linearized + [LEFT_OUT] * result.lossy
+    if result.assumed:
+        notes.append(ASSUMED.format(", ".join(result.assumed)))
     for note in notes:
         yield from wrapped(note, "  ", "    ")
     yield ""

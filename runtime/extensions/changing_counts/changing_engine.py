@@ -10,7 +10,7 @@ At the start of the frame of a change, in this order:
 
 1. The peers that leave are removed, with all their packets, also those in transit.
 2. Each peer that joins has its start values. The states and stored values of its parts in `PeerType.joining`
-   (shared objects, and the parts that send) are the mean of those of the peers that stay.
+   are the mean of those of the peers that stay.
 3. The packets of a peer that joins are, at each instant of sending, the mean m of the packets of the peers of
    its group that stay, shifted to its own values: m + s(own values) − mean of s(values of the others), where
    s gives the sent values. If all its sent values are means, so are its packets.
@@ -28,7 +28,6 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.compiled import PeerType
 from apc.extensions.changing_counts.peer_times import counts_of, model_of_present
 from apc.network.packet_schedule import START, DeliveredPackets, Timetable
 from apc.simulation.compiled_engine import CompiledEngine
@@ -290,7 +289,7 @@ def _set_joining_values(
     """
     peer_type, layout = member.program.peer_type, member.program.layout
     for row, state in enumerate(peer_type.states):
-        if _is_mean(peer_type, state.name) and state.name in means:
+        if peer_type.joins_at_mean(state.name) and state.name in means:
             carry[row, joining] = means[state.name]
     partitions = {partition.clock: partition for partition in peer_type.clocks}
     names = [
@@ -299,13 +298,8 @@ def _set_joining_values(
         *(peer_type.clocks[value.partition].outputs[value.output] for value in layout.later_values),
     ]
     for row, name in enumerate(names, layout.states):
-        if _is_mean(peer_type, name) and len(staying):
+        if peer_type.joins_at_mean(name) and len(staying):
             carry[row, joining] = carry[row, staying].mean()
-
-
-def _is_mean(peer_type: PeerType, name: str) -> bool:
-    """Return whether a value belongs to a part whose values at a joining peer are means."""
-    return any(name.startswith(f"{part}.") for part in peer_type.joining)
 
 
 def _sent(member: GroupProgram, carry: Floats, link: str, channel: str, seconds: float) -> Floats:

@@ -8,10 +8,11 @@ Does not: treat peers that are not interchangeable; find the shortest dwell time
 
 The peers of a group are equal and receive each other's mean or sum. With x̄ the mean of their states and d_i
 the deviation of peer i, a frame is x̄⁺ = M_c(N) x̄ and d_i⁺ = M_d(N) d_i. A peer that joins starts at the mean
-of the others, in all its states and packets: no deviation changes. A peer that leaves takes its deviation
-with it. Let V = Σ_i d_iᵀ P d_i. A join leaves V unchanged; a leave lowers it by (1 + 1/(N − 1)) d_iᵀ P d_i.
-If M_d(N)ᵀ P M_d(N) ≺ P for every N, V decays under any sequence of changes at the starts of frames, and so
-do the jumps of x̄. If moreover M_c(N)ᵀ P_c M_c(N) ≺ P_c for every N, all motions decay.
+of the others, in all its states and packets (`joining: mean` of every part): no deviation changes. A peer
+that leaves takes its deviation with it. Let V = Σ_i d_iᵀ P d_i. A join leaves V unchanged; a leave lowers it
+by (1 + 1/(N − 1)) d_iᵀ P d_i. If M_d(N)ᵀ P M_d(N) ≺ P for every N, V decays under any sequence of changes at
+the starts of frames, and so do the jumps of x̄. If moreover M_c(N)ᵀ P_c M_c(N) ≺ P_c for every N, all motions
+decay.
 
 Otherwise each N has a P_N of its own. With M_Nᵀ P_N M_N ≺ P_N and (M_N^k)ᵀ P_L M_N^k ≺ P_N for all N, L, all
 motions decay if at least k frames pass between changes (Geromel and Colaneri, SIAM Journal on Control and
@@ -34,7 +35,7 @@ from numpy.typing import NDArray
 
 from apc.analysis.analysis import lifted_groups
 from apc.analysis.one_sided_slopes import sides
-from apc.compiler.compiled import group_count
+from apc.compiler.compiled import Model, group_count
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.timings import part
 from apc.lifting.interval_arithmetic import MIDPOINT_RADIUS, error_radius, value_of, with_error_radius
@@ -101,7 +102,8 @@ class ChangingCounts(Result):
 
     `counts` are the numbers of peers of `parameter`. `dwell_frames` and `dwell_s` are a proved sufficient
     time between changes, None without one or if any changes are allowed. `sequence` and `growth` are those of
-    the family of motions that grows most, empty without one.
+    the family of motions that grows most, empty without one. `assumed` are the parts that start at the mean
+    of the other peers in this analysis, but at their start values in a simulation (`joining: start`).
     """
 
     shown_by = "apc.extensions.changing_counts.changing_counts_output:changing_counts"
@@ -117,6 +119,7 @@ class ChangingCounts(Result):
     families: tuple[MotionFamily, ...]
     linearized: bool
     lossy: bool
+    assumed: tuple[str, ...] = ()
 
     @property
     def dwell_s(self) -> float | None:
@@ -172,6 +175,29 @@ def changing_counts(numeric: NumericModel, text: str, *, lossy: bool = False) ->
         families=results,
         linearized=not numeric.affine,
         lossy=lossy,
+        assumed=_parts_at_start(numeric.model),
+    )
+
+
+def _parts_at_start(system: Model) -> tuple[str, ...]:
+    """Return the parts with states or stored values that are not means at a joining peer."""
+    names = [
+        (peer_type, name)
+        for peer_type in system.peer_types
+        for name in (
+            *(state.name for state in peer_type.states),
+            *(
+                partition.outputs[output]
+                for partition in peer_type.clocks
+                for output in (
+                    *partition.memories,
+                    *(hold.output for hold in peer_type.holds if hold.clock == partition.clock),
+                )
+            ),
+        )
+    ]
+    return tuple(
+        dict.fromkeys(name.partition(".")[0] for type_, name in names if not type_.joins_at_mean(name))
     )
 
 

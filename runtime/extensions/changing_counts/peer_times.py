@@ -151,9 +151,11 @@ def _peer_of(system: Model, key: str, item: PeerTime) -> tuple[Group, int]:
     if parsed and group and 1 <= (number := int(parsed["number"] or 1)) <= group.count:
         return group, number
     known = ", ".join(f"{group.name}[1] to {group.name}[{group.count}]" for group in system.groups[:4])
-    above = parsed and group and int(parsed["number"] or 1) > group.count
-    fix = f"--set {group_count(parsed['group'])}={parsed['number']}" if parsed and above else ""
-    raise _fault(system, key, item, key, f"a peer of the topology ({known})", item.peer[:40], fix)
+    fix, advice = "", ""
+    if parsed and group and int(parsed["number"] or 1) > group.count:
+        name, least = group_count(group.name), parsed["number"]
+        fix, advice = ("", f"raise {name} to {least}") if item.line else (f"--set {name}={least}", "")
+    raise _fault(system, key, item, key, f"a peer of the topology ({known})", item.peer[:40], fix, advice)
 
 
 def _check_time(system: Model, key: str, item: PeerTime, duration: Fraction, frame_s: Fraction) -> None:
@@ -231,10 +233,17 @@ def model_of_present(system: Model, present: Flags) -> Model:
 
 
 def _fault(
-    system: Model, key: str, item: PeerTime, subject: str, expected: str, got: str = "", fix: str = ""
+    system: Model,
+    key: str,
+    item: PeerTime,
+    subject: str,
+    expected: str,
+    got: str = "",
+    fix: str = "",
+    advice: str = "",
 ) -> ApcError:
     """Return the error E914 of a join or leave, at its location."""
-    return fault("E914", location_of(system, key, item), subject, expected, got or _s(item.at), fix)
+    return fault("E914", location_of(system, key, item), subject, expected, got or _s(item.at), fix, advice)
 
 
 def _written(key: str, item: PeerTime, at: str) -> str:
