@@ -101,7 +101,11 @@ class ChangingEngine:
         last = int(simulation.settings.duration / simulation.quantum)
         self.changes = (self.presence.changes(last) // simulation.frame).tolist()
         self.simulations: dict[object, Simulation] = {}
-        self.prepared: dict[bytes, PresentPeers] = {}
+        starts = self.presence.first_peers
+        self.column_of = {
+            (signal.group, starts[signal.group] + signal.peer - 1, signal.local): column
+            for signal, column in zip(simulation.signals, simulation.order.tolist(), strict=True)
+        }
         self.routes = simulation.population.exchange_program.routes
         self.first = tuple(
             self.presence.joins[route.pairs].max(axis=1) // simulation.frame * route.slots
@@ -109,15 +113,14 @@ class ChangingEngine:
         )
         self.begin(0)
         for frame in self.changes:  # errors of all numbers of peers are found before the first row
-            self._present_at(frame)
+            self._simulation(self._present_in(frame))
 
     def begin(self, run: int) -> None:
         """Reset all peers to time 0 of a run (see `population.FrameEngine`)."""
-        self.run, self.work_of_absent = run, np.zeros(len(self.simulation.population.parts))
+        self.work_of_absent = np.zeros(len(self.simulation.population.parts))
         seed = self.simulation.seed
         self.source = Timetable(self.routes, self.simulation.arrival_processes, seed=seed, run=run)
-        self.now = self._present_at(0)
-        self.now.engine.begin(run)
+        self.now = self._prepare(self._present_in(0))
 
     def advance(self, first: int, count: int, pushes: Sequence[Floats | None]) -> FrameRows:
         """Simulate the frames from number `first` on (see `population.FrameEngine`)."""
@@ -145,29 +148,21 @@ class ChangingEngine:
         """Return whether all states of the present peers are finite."""
         return self.now.engine.in_range()
 
-    def _present_at(self, frame: int) -> PresentPeers:
-        """Return the simulation of the peers that are present in a frame."""
-        present = self.presence.at(np.array([frame * self.simulation.frame]))[0]
-        key = present.tobytes()
-        if key not in self.prepared:
-            self.prepared[key] = self._prepare(present)
-        return self.prepared[key]
+    def _present_in(self, frame: int) -> Flags:
+        """Return which peers are present in a frame (N,)."""
+        present: Flags = self.presence.at(np.array([frame * self.simulation.frame]))[0]
+        return present
 
     def _prepare(self, present: Flags) -> PresentPeers:
-        """Return the present peers with their simulation, an engine, and the indices of signals and links."""
-        base, starts = self.simulation, self.presence.first_peers
-        simulation = self._simulation(present)
-        column_of = {
-            (signal.group, starts[signal.group] + signal.peer - 1, signal.local): column
-            for signal, column in zip(base.signals, base.order.tolist(), strict=True)
-        }
+        """Return the present peers with their simulation, and a new engine."""
+        simulation, starts = self._simulation(present), self.presence.first_peers
         peers, counts = np.flatnonzero(present), [group.count for group in simulation.system.groups]
         first = dict(zip(starts, np.cumsum([0, *counts]).tolist(), strict=False))
         pairs = [
-            (source, column_of[key])
+            (source, self.column_of[key])
             for signal, source in zip(simulation.signals, simulation.order.tolist(), strict=True)
             if (key := (signal.group, int(peers[first[signal.group] + signal.peer - 1]), signal.local))
-            in column_of
+            in self.column_of
         ]
         sources, targets = np.array(pairs, np.int64).reshape(-1, 2).T
         routes = zip(simulation.population.exchange_program.routes, self.routes, strict=True)
@@ -198,7 +193,7 @@ class ChangingEngine:
 
     def _change(self, frame: int) -> None:
         """Pass to the peers that are present from a frame on."""
-        old, new = self.now, self._present_at(frame)
+        old, new = self.now, self._prepare(self._present_in(frame))
         members = list(zip(old.simulation.population.members, old.engine.carries, strict=True))
         for group, (member, carry) in enumerate(members):
             layout, leaving = member.program.layout, old.indices(group, ~new.present)
@@ -206,7 +201,6 @@ class ChangingEngine:
             np.add.at(self.work_of_absent, parts, carry[layout.work][:, leaving].sum(axis=1))
         carries, packets = _changed(old, new, frame)
         received = [_received(old, new, route, carries, frame) for route in range(len(self.routes))]
-        new.engine.begin(self.run)
         for array, values in zip(new.engine.carries, carries, strict=True):
             array[:] = values
         new.engine.packets[:] = packets
