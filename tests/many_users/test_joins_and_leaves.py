@@ -347,7 +347,7 @@ peers:
   user: {set: {cube.x: [1 mm, -2 mm, 0 mm, 0 mm]}}
 masses: {cube: {mass: 0.8 kg, damping: 2 N*s/m, shared: true}}
 couplers: {coordination: {type: AveragePosition, object: cube, stiffness: 100 N/m, clock: haptic, link: lan}}
-links: {lan: {clock: network, delay: 8 ms, loss: 40 %}}
+links: {lan: {clock: network, delay: 8 ms, loss: 75 %}}
 experiment:
   duration: 0.4 s
   seed: 7

@@ -82,8 +82,8 @@ class PresentDeliveries:
         for delivered, links, first in zip(self.source.take(until), self.links, self.first, strict=True):
             packets = delivered.packets[:, links]
             early = packets < first[links]
-            missing = delivered.missing[:, links] & ~early
-            result.append(DeliveredPackets(np.ascontiguousarray(np.where(early, START, packets)), missing))
+            in_effect = np.ascontiguousarray(np.where(early, START, packets))
+            result.append(DeliveredPackets(in_effect, delivered.missing[:, links]))
         return tuple(result)
 
 
