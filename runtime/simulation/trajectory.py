@@ -31,6 +31,7 @@ from apc.simulation.signals import Signal
 from apc.simulation.simulation import Simulation, check_length, prepare
 from apc.simulation.summary import Summary, SummaryAccumulator, checked_by_analysis
 from apc.support.distribution import versions
+from apc.support.extension_table import require_extension
 from apc.support.memory import refuse_beyond
 from apc.support.option_value import option_value
 
@@ -212,8 +213,11 @@ def run_simulation(
             raise
         interrupted = True
     summary = accumulator.summary(block)
-    if simulation.settings.method.name in (EXACT, WHERE_NEEDED) and simulation.presence is None:
-        summary = checked_by_analysis(summary, simulation.topology)
+    if simulation.settings.method.name in (EXACT, WHERE_NEEDED):
+        system = simulation.topology
+        if simulation.presence is not None:
+            system = require_extension("changing_counts").model_at_end(simulation)
+        summary = checked_by_analysis(summary, system)
     return summary, interrupted
 
 

@@ -52,6 +52,7 @@ EXTENSIONS = {
             (
                 "changing_engine:changing_engine",
                 "joins_and_leaves:changing_counts",
+                "peer_times:model_at_end",
                 "peer_times:presence_of",
                 "peer_times:with_peer_times",
             ),

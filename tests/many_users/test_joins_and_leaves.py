@@ -449,3 +449,26 @@ def test_a_component_declares_the_values_of_a_joining_peer(entry: str, expected:
         run["user[3].device.x"][80] == pytest.approx(mean if expected == "mean" else 0.0, rel=1e-12) and mean
     )
     assert ("device" in apc.changing_counts(path, "user.count=2:3").assumed) == (expected == "start")
+
+
+@pytest.mark.parametrize(
+    ("key", "at", "duration", "verdict"),
+    [
+        ("joins", "0.8 s", "4 s", "diverges"),
+        ("leaves", "0.8 s", "4 s", "decays"),
+        ("joins", "1 s", "1.2 s", "not determined"),
+        ("joins", "1.16 s", "1.2 s", "not determined"),
+    ],
+)
+def test_the_verdict_is_that_of_the_peers_at_the_end(key: str, at: str, duration: str, verdict: str) -> None:
+    """Three users of the mesh are stable, four are not."""
+    times = {key: {"user[4]": at}}
+    run = apc.simulate(MESH, params={"user.count": 4}, duration=duration, impulse="user[1]", **times)  # type: ignore[arg-type]
+    assert run.summary.verdict == verdict
+    analysis = apc.analyze(MESH, params={"user.count": 4 if key == "joins" else 3})
+    if verdict == "not determined":
+        assert "apc analyze: unstable" in run.summary.reason
+    else:
+        assert run.summary.fit is not None
+        rate = np.log(analysis.spectral_radius) / FRAME
+        assert run.summary.fit.rate == pytest.approx(rate, rel=1e-3)

@@ -1,7 +1,8 @@
 """The instants at which peers join and leave a simulation.
 
 Takes: texts of options; the joins and leaves of a model's experiment.
-Gives: `with_peer_times`, `presence_of`, `counts_of`, `model_of_present`.
+Gives: `with_peer_times`, `presence_of`, `counts_of`, `model_of_present`,
+`model_at_end`.
 Guarantees: all invalid instants are reported together (E914). Peers join and leave at the starts of frames.
 Does not: simulate (see `changing_engine`).
 """
@@ -24,6 +25,7 @@ from apc.compiler.source.reading import fault
 from apc.parameter_values.overrides import Override, apply
 from apc.parameter_values.parameter_names import OVERRIDE, find
 from apc.simulation.presence import Presence, first_peers, location_of
+from apc.simulation.simulation import Simulation
 from apc.timing.schedule import Schedule
 
 Flags = NDArray[np.bool_]
@@ -230,6 +232,13 @@ def model_of_present(system: Model, present: Flags) -> Model:
             for old, new in zip(system.groups, changed.groups, strict=True)
         ),
     )
+
+
+def model_at_end(simulation: Simulation) -> Model:
+    """Return the model of the peers that are present at the end of a simulation with joins or leaves."""
+    assert simulation.presence is not None
+    end = np.array([int(simulation.settings.duration / simulation.quantum)])
+    return model_of_present(simulation.topology, simulation.presence.at(end)[0])
 
 
 def _fault(
