@@ -39,13 +39,13 @@ class Presence:
 
     def changes(self, last: int) -> Integers:
         """Return the instants after time 0 and until `last` at which peers join or leave, in rising order."""
-        instants = np.unique([*self.joins, *self.leaves])
+        instants = np.unique(np.concatenate([self.joins, self.leaves]))
         return instants[(instants > 0) & (instants <= last)]
 
     def of(self, signals: Sequence[Signal], instants: Integers) -> Flags:
         """Return whether the peers of some signals are present at some instants (n, signals)."""
         peers = [self.first_peers[signal.group] + signal.peer - 1 for signal in signals]
-        return self.at(instants)[:, peers]
+        return (self.joins[peers] <= instants[:, None]) & (instants[:, None] < self.leaves[peers])
 
 
 def first_peers(system: Model) -> dict[str, int]:

@@ -103,15 +103,16 @@ def presence_of(system: Model, schedule: Schedule, duration: Fraction) -> Presen
     mistakes, frame_s = Mistakes(), schedule.frame_s
     joins = np.zeros(system.peers, np.int64)
     leaves = np.full(system.peers, NEVER)
-    first, last_of = first_peers(system), dict[tuple[str, int], PeerTime]()
+    first = first_peers(system)
     for key, array in (("joins", joins), ("leaves", leaves)):
+        given = set[int]()
         for item in getattr(system.experiment, key):
             with mistakes:
-                peer = first[(found := _peer_of(system, key, item))[0].name] + found[1] - 1
-                name = f"{found[0].name}[{found[1]}]"
-                if (key, peer) in last_of:
+                group, number = _peer_of(system, key, item)
+                peer, name = first[group.name] + number - 1, f"{group.name}[{number}]"
+                if peer in given:
                     raise _fault(system, key, item, name, f"one instant in {key}", "two")
-                last_of[key, peer] = item
+                given.add(peer)
                 _check_time(system, key, item, duration, frame_s)
                 array[peer] = int(item.at / schedule.quantum)
                 if key == "leaves" and item.at <= (join := joins[peer] * schedule.quantum):
