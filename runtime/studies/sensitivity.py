@@ -33,6 +33,7 @@ from apc.linearization.evaluation_errors import finite_equations
 from apc.network.nominal_criterion import channel_numbers
 from apc.parameter_values.display_units import DisplayUnit
 from apc.parameter_values.parameter_names import ParameterRef, named_times, parameter_of, unit_of, value_now
+from apc.parameter_values.parameters import scope_of
 from apc.result import Result
 from apc.spectrum.eigenpairs import driving_parts, eigenpairs
 from apc.studies.evaluator import evaluator, free_parameters
@@ -337,8 +338,15 @@ def not_varied(count: int, growth: StabilityMeasure) -> str:
 
 
 def channel_parameters(system: Model) -> list[ParameterRef]:
-    """Return the independent loss and jitter parameters of links."""
-    numbers = channel_numbers(system)
+    """Return the independent loss and jitter parameters of links.
+
+    Of a link with independent losses, `loss: 2 %`, the probabilities of bursts are left out.
+    """
+    holder, numbers = scope_of(system).holder, set(channel_numbers(system))
+    for link in system.links:
+        loss = None if link.channel is None else link.channel.loss
+        if loss is not None and holder[loss.r].formula is not None:
+            numbers -= {loss.one_minus_h, loss.one_minus_k}
     times = [ParameterRef(timing.name) for timing in named_times(system) if timing.formula is None]
     return [
         parameter_ref for parameter_ref in (*free_parameters(system), *times) if parameter_ref.name in numbers
