@@ -83,9 +83,6 @@ WIDE, NARROWINGS = 1e-7, 24
 # An error above this, relative to the value, remains only if verdicts at this distance are undecided.
 RESOLUTION = 9.9e-7
 
-# The number of equal results after which an expensive parameter counts as without effect.
-STILL = 4
-
 # The note on a crossing between two periods of a clock.
 PERIOD = "period"
 
@@ -432,8 +429,7 @@ def _first_samples(segment: SmoothSegment, *, first: bool) -> tuple[_Samples, st
             samples = samples.merged(_samples_at(segment, np.array([point])))
         except ApcError as error:
             return samples, error.mistakes[0].message
-        growth = samples.log_radius
-        if growth[-1] >= 0 > growth[0] or (len(growth) == STILL and np.ptp(growth) == 0):
+        if samples.log_radius[-1] >= 0 > samples.log_radius[0]:
             break
     return samples, ""
 

@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import Analysis, analyze, lifted_groups, prepare_at_start
+from apc.analysis.analysis import Analysis, analyze, lifted_groups
 from apc.analysis.one_sided_slopes import sides
 from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError, SourceLocation
@@ -42,9 +42,9 @@ from apc.result import Result
 from apc.spectrum.modes import decompose
 from apc.spectrum.peer_classes import states_of
 from apc.spectrum.spectrum import finite
-from apc.studies.crossing import ESTIMATE, CrossingReport, search
+from apc.studies.crossing import ESTIMATE, CrossingReport, search, stable_in_all
 from apc.studies.evaluator import evaluator, free_parameters, many_packets
-from apc.studies.evaluator_choice import radius_evaluator
+from apc.studies.evaluator_choice import evaluator_for, radius_evaluator
 from apc.studies.parameter_path import DelayPath, MatrixPath, delay_reach, verdict_of
 from apc.studies.sensitivity import channel_parameters, not_varied
 from apc.studies.stability_criteria import (
@@ -141,41 +141,46 @@ def margins(numeric: NumericModel, *, quick: bool = False, analysis: Analysis | 
     """
     system = numeric.model
     with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
-        parameter_refs = coupler_parameters(system)
-        delays = _delays(system)
-        start = prepare_at_start(numeric, [*parameter_refs, *delays])
-        linearized = start or numeric
-        # Times do not change an equilibrium, at which a delay then finds one linearization.
-        for_delays = prepare_at_start(numeric, delays) if system.at_equilibrium else start
-        delays = delays if for_delays is not None else []
-        first_side = sides(linearized)[0]  # all sides have the same states
-        states = _loop_sizes(first_side.numeric, most=MOST_IN_PASSING if quick else math.inf)
+        parameter_refs, delays = coupler_parameters(system), _delays(system)
+        linearized = evaluator_for(numeric, [*parameter_refs, *delays]).linearized
+        # Times do not move an equilibrium, at which a delay then finds one linearization.
+        for_delays = linearized or evaluator_for(numeric, delays).linearized
+        first_side = (linearized or for_delays or (sides(numeric)[0].numeric,))[0]  # all have the same states
+        states = _loop_sizes(first_side, most=MOST_IN_PASSING if quick else math.inf)
         if not states:
             return Margins((), TAKES_LONG)
         largest = max(states)
-        slow = largest > MOST_SCANNED and many_packets(linearized)
+        slow = largest > MOST_SCANNED and many_packets(first_side)
         searched = parameter_refs if slow or largest <= MOST_SCANNED else []
         skipped = [
             not_evaluated(system, parameter_ref, f"{largest:,} states")
             for parameter_ref in parameter_refs
             if parameter_ref not in searched
         ]
-        pointwise = slow or start is None
         now = analysis or analyze(numeric)
         if not now.stable and now.verdict is not StabilityVerdict.DRIFTS:
             return Margins((), NOT_STABLE.format("stable" if now.stable is False else "proved stable"))
         if not any(states):
             return Margins((), "none: the topology has no motion")
-        paths = zip(searched, _margin_paths(linearized, searched, pointwise=pointwise), strict=True)
+        paths = _margin_paths(numeric, () if slow else linearized, searched)
         rows = [
-            _margin(system, parameter_ref, search(path, first=True)) for parameter_ref, path in paths if path
+            _margin(system, parameter_ref, stable_in_all([search(path, first=True) for path in of_parameter]))
+            for parameter_ref, of_parameter in zip(searched, paths, strict=True)
+            if of_parameter
         ]
-        rows += [
-            *skipped,
-            *(_delay_margin(for_delays or linearized, delay, largest, now) for delay in delays),
-        ]
-        result = tuple(filter(None, rows))
-        return Margins(result, _common_note(result, for_delays))
+        rows += skipped
+        if for_delays:
+            rows += [_delay_margin(for_delays, delay, largest, now) for delay in delays]
+        result, notes = tuple(filter(None, rows)), list[str]()
+        if delays and not for_delays:
+            notes.append("delays were not varied, as the linearization depends on the initial packets")
+        if estimated := [row.parameter for row in result if row.estimated]:
+            notes.append(f"{ESTIMATE}: {', '.join(estimated)}")
+        if not (parameter_refs or delays):
+            notes.append("none: there is no parameter to vary")
+        elif not result and not notes:
+            notes.append("none: no varied parameter affects stability")
+        return Margins(result, "\n".join(notes))
 
 
 def _loop_sizes(numeric: NumericModel, *, most: float) -> list[int]:
@@ -187,15 +192,6 @@ def _loop_sizes(numeric: NumericModel, *, most: float) -> list[int]:
         return []
     states = [loop.states for loop in decompose(*lifted_groups(numeric)).loops]
     return states if events + sum(state**2 for state in states) <= most else []
-
-
-def _common_note(rows: Sequence[Margin], start: NumericModel | None) -> str:
-    """Return the note on all margins together."""
-    estimated = [row.parameter for row in rows if row.estimated]
-    notes = ["delays were not varied, as the linearization depends on the initial packets"] * (start is None)
-    notes += [f"{ESTIMATE}: {', '.join(estimated)}"] * bool(estimated)
-    notes += ["none: there is no parameter to vary"] * (not rows)
-    return "\n".join(notes)
 
 
 def coupler_parameters(system: Model) -> list[ParameterRef]:
@@ -230,38 +226,43 @@ def _delays(system: Model) -> list[ParameterRef]:
 
 
 def _margin_paths(
-    numeric: NumericModel, parameter_refs: Sequence[ParameterRef], *, pointwise: bool
-) -> Iterator[MatrixPath | PointwisePath | None]:
-    """Yield the path of each parameter from its present value upwards, None if it is at its maximum.
+    numeric: NumericModel, linearized: Sequence[NumericModel], parameter_refs: Sequence[ParameterRef]
+) -> Iterator[Sequence[MatrixPath | PointwisePath]]:
+    """Yield the paths of each parameter from its present value upwards, none if it is at its maximum.
 
-    A parameter of 0 has a separate evaluator: a mode that is rigid at a stiffness of 0 is not rigid at other
-    values. With `pointwise` each value is analysed separately.
+    There is one path for each of the linearized models, the sides of a kink; without linearized models, one
+    path whose values are analyzed separately. A parameter of 0 has a separate evaluator: a mode that is rigid
+    at a stiffness of 0 is not rigid at other values.
     """
     system = numeric.model
     base = np.array([parameter_of(system, parameter_ref).value for parameter_ref in parameter_refs])
     nonzero = [parameter_ref for parameter_ref, value in zip(parameter_refs, base, strict=True) if value]
     for parameter_ref, present in zip(parameter_refs, base.tolist(), strict=True):
         most = allowed(system, parameter_ref)[1]
-        if pointwise:
+        if not linearized:
             source = RadiusEvaluator(numeric, (parameter_ref,), LOCATION, NOMINAL)
             points, least = _margin_points(system, parameter_ref, abs(present) or 1.0)
-            yield PointwisePath(source, points, least) if points[-1] > present else None
+            yield [PointwisePath(source, points, least)] if points[-1] > present else []
             continue
         varied = nonzero if present else [parameter_ref]
         values = base[base != 0] if present else np.zeros(1)
-        path = MatrixPath(evaluator(numeric, varied), numeric, values, varied.index(parameter_ref), present)
-        top = min(GROWTH * path.scale, most)
-        yield replace(path, top=top) if top > present else None
+        paths = [
+            MatrixPath(evaluator(side, varied), side, values, varied.index(parameter_ref), present)
+            for side in linearized
+        ]
+        tops = [min(GROWTH * path.scale, most) for path in paths]
+        yield [replace(path, top=top) for path, top in zip(paths, tops, strict=True) if top > present]
 
 
 def _delay_margin(
-    numeric: NumericModel, parameter_ref: ParameterRef, largest: int, analysis: Analysis
+    linearized: Sequence[NumericModel], parameter_ref: ParameterRef, largest: int, analysis: Analysis
 ) -> Margin | None:
     """Return the margin of a delay, without a value if the search would take too long.
 
-    `largest` is the number of states of the model's largest loop; `analysis` is that at the present values.
+    `linearized` are the sides of a kink, or the model; `largest` is the number of states of its largest loop;
+    `analysis` is that at the present values.
     """
-    system = numeric.model
+    system = linearized[0].model
     if len(times_of(system, parameter_ref.name)) > 1:
         return not_evaluated(system, parameter_ref, "the value differs between groups")
     now = delay_now(system, parameter_ref)
@@ -274,8 +275,9 @@ def _delay_margin(
     if largest > MOST_DELAYED and not is_link_delay:
         return not_evaluated(system, parameter_ref, f"{largest:,} states in each order of events")
     try:
-        path = DelayPath(parameter_ref, numeric, now, end, known={now: verdict_of(analysis)})
-        return _margin(system, parameter_ref, search(path, first=True))
+        known = {now: verdict_of(analysis)} if len(linearized) == 1 else {}
+        paths = [DelayPath(parameter_ref, side, now, end, known=dict(known)) for side in linearized]
+        return _margin(system, parameter_ref, stable_in_all([search(path, first=True) for path in paths]))
     except ApcError as error:
         return not_evaluated(system, parameter_ref, error.mistakes[0].message)
 

@@ -131,6 +131,15 @@ def test_a_critical_value_is_that_of_the_worse_side(tmp_path: Path) -> None:
     assert radius(found.value * (1 - 1e-9)) < 1 < radius(found.value * (1 + 1e-9))
 
 
+def test_a_margin_at_a_kink_is_that_of_the_side_that_loses_stability(tmp_path: Path) -> None:
+    """The free side has the larger radius, and does not depend on K; the other side decides the limit."""
+    found = apc.margins(model(tmp_path, f"max(0, K*{X})", ", K: 6000 N/m"))
+    (row,) = found.rows
+    assert row.value is not None and not found.note
+    assert row.value == pytest.approx(40133.778369378, abs=1e-5)
+    assert radius(row.value * (1 - 1e-9)) < 1 < radius(row.value * (1 + 1e-9))
+
+
 @pytest.mark.parametrize("gain", ["gain", "other"])
 def test_sides_of_equal_slopes_part_where_a_gain_varies(gain: str, tmp_path: Path) -> None:
     """max(k x, l x) with k = l has one slope; at any other value of k or l it has two."""
