@@ -1,9 +1,9 @@
-"""Exact graph weights: the decimals of the file, and each peer's sum of weights.
+"""Arcs of a graph and exact weights: the decimals of the file, and each peer's sum of weights.
 
-Takes: weights as floats, each representing its shortest decimal.
-Gives: `exact_weight`, `sum_weights`.
+Takes: a `Graph`; weights as floats, each representing its shortest decimal.
+Gives: `arcs` of a graph; `exact_weight`, `sum_weights`.
 Guarantees: sums are exact, so that 0.1 and 0.2 are 0.3, and 0.1, 0.2 and −0.3 are zero.
-Does not: handle graphs (see `topology.graphs`).
+Does not: read graphs (see `topology.graphs`).
 
 Neutral modes are determined by exact equality. For the weights 0.1 and 0.2 of a peer's neighbors, a rounded
 sum as its own weight would act as a spring to ground.
@@ -18,6 +18,27 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from apc.compiler.compiled import Graph
+
+
+def arcs(graph: Graph, peers: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return the (sender, receiver) pairs (M, 2) of a graph and their weights (M,)."""
+    peer_numbers = np.arange(peers, dtype=np.int64)
+    if graph.shape == "arcs":
+        return graph.arcs, graph.weights
+    if graph.shape == "ring":
+        next_peers = np.roll(peer_numbers, -1)
+        one_direction = (
+            np.stack([peer_numbers, next_peers], axis=1) if peers > 2 else np.array([[0, 1]])[: peers - 1]
+        )
+    elif graph.shape == "star":
+        one_direction = np.stack([np.zeros(max(peers - 1, 0), np.int64), peer_numbers[1:]], axis=1)
+    else:
+        assert graph.shape == "complete", f"no such graph: {graph.shape}"
+        one_direction = np.stack(np.triu_indices(peers, 1), axis=1)
+    pairs = np.concatenate([one_direction, one_direction[:, ::-1]]).astype(np.int64)
+    return pairs, np.ones(len(pairs))
 
 
 def exact_weight(weight: float) -> Fraction:

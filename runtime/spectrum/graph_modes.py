@@ -17,10 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import Graph
-from apc.compiler.weights import exact_weight, sum_weights
+from apc.compiler.weights import arcs, exact_weight, sum_weights
 from apc.lifting.interval_arithmetic import UNIT_ROUNDOFF
 from apc.spectrum.null_space import null_space
-from apc.timing.communication_graph import arcs
 
 Integers = NDArray[np.int64]
 

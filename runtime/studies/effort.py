@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import Link, Model, PeerType, Receive
 from apc.compiler.expression_data import POLISH, straight
+from apc.compiler.weights import arcs
 from apc.parameter_values.parameters import resolve
-from apc.timing.communication_graph import arcs
 
 Integers = NDArray[np.int64]
 

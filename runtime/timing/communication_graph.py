@@ -1,7 +1,7 @@
 """Communication graphs: senders, receivers, weights and delays of the links between the peers of a model.
 
 Takes: a `Model` and its timings.
-Gives: `CommunicationGraph`, `build_exchange`, `arcs`, `check_mean`.
+Gives: `CommunicationGraph`, `build_exchange`, `check_mean`.
 Guarantees: a complete graph, a ring and a star cost no more than their arcs.
 Does not: know values or instants (see `scheduling`), or a graph's eigenvalues (see `graph_modes`).
 """
@@ -17,8 +17,9 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.compiled import Graph, Link, Model
+from apc.compiler.compiled import Link, Model
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
+from apc.compiler.weights import arcs
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -138,25 +139,6 @@ def _cached_graph(
         default_delay={link.name: link.delay for link in links},
         pair_delay=pair_delay,
     )
-
-
-def arcs(graph: Graph, peers: int) -> tuple[Integers, Floats]:
-    """Return the (sender, receiver) pairs (M, 2) of a graph and their weights (M,)."""
-    peer_numbers = np.arange(peers, dtype=np.int64)
-    if graph.shape == "arcs":
-        return graph.arcs, graph.weights
-    if graph.shape == "ring":
-        next_peers = np.roll(peer_numbers, -1)
-        one_direction = (
-            np.stack([peer_numbers, next_peers], axis=1) if peers > 2 else np.array([[0, 1]])[: peers - 1]
-        )
-    elif graph.shape == "star":
-        one_direction = np.stack([np.zeros(max(peers - 1, 0), np.int64), peer_numbers[1:]], axis=1)
-    else:
-        assert graph.shape == "complete", f"no such graph: {graph.shape}"
-        one_direction = np.stack(np.triu_indices(peers, 1), axis=1)
-    pairs = np.concatenate([one_direction, one_direction[:, ::-1]]).astype(np.int64)
-    return pairs, np.ones(len(pairs))
 
 
 def check_mean(

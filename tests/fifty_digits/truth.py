@@ -17,11 +17,10 @@ import flint
 import numpy as np
 
 from apc.compiler.compiled import Model
-from apc.compiler.weights import exact_weight
+from apc.compiler.weights import arcs, exact_weight
 from apc.parameter_values.parameters import resolve
 from apc.simulation.simulation import ROW
 from apc.spectrum.ball_arithmetic import precision, rational_ball
-from apc.timing.communication_graph import arcs
 from tests.fifty_digits.events import Happening, Number, Peer, Play, Whom, build_peers, refusal, ticks_between
 
 # What is asked of a reference, relative to the largest: far beyond what floats can be wrong by.

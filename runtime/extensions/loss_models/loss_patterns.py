@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import Link, Model
+from apc.compiler.weights import arcs
 from apc.extensions.loss_models.self_substitution import receivers_of
 from apc.lifting.interval_arithmetic import value_of
 from apc.mean_square.class_moments import PerTickReception, neutral_motions, stored_of
@@ -33,7 +34,6 @@ from apc.spectrum.matrix_norms import balance
 from apc.spectrum.modes import dense_loop
 from apc.spectrum.relative_coordinates import Relative, relative_coordinates
 from apc.support.not_supported import NotSupportedError
-from apc.timing.communication_graph import arcs
 
 Floats = NDArray[np.float64]
 
