@@ -12,8 +12,8 @@ Shared      `errors`, `wording`, `number_parsing`; `timings` of a command; `file
             `component`: data types; `declarations`, `parts`, `component_check`, `definitions`,
             `component_library`
 `topology`  `topology_parameters`, `timebase`, `instances`, `redeclarations`, `graphs`,
-            `links`, `groups`, `studies`: one section each; `topology_warnings`: warnings; `topology`: all
-            sections
+            `channels`, `links`, `groups`, `studies`: one section each; `topology_warnings`: warnings;
+            `topology`: all sections
 `equations` `connections`, `flatten`: connectors to equations; `clocks`: partitions; `terms`, `divisor_test`:
             SymPy; `linear_decomposition`; `derivatives`, `solution`: data types; `matching`, `elimination`,
             `blt_solver`: solving; `aliases`, `index`: index reduction; `causalization`: all of these

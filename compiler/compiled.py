@@ -1,7 +1,7 @@
 """The compiled model: CasADi functions of each peer type, and the communication structure.
 
 Takes: nothing (data types, created by the stage `functions` and read by the runtime).
-Gives: `Model` and its parts: `Clock`, `Graph`, `PairDelay`, `Loss`, `Channel`, `Link`; `Formula`, `Timing`,
+Gives: `Model` and its parts: `Clock`, `Graph`, `Loss`, `Channel`, `GroupPair`, `Link`; `Formula`, `Timing`,
 `Parameter`; `State`, `Hold`, `Receive`, `ClockPartition`, `SendPartition`, `ForcePorts`, `Limit`, `Replaced`,
 `PeerType`; `PeerColumn`, `Group`; `PeerTime`, `Experiment`, `Axis`. The names of counted parameters: `PEERS`,
 `count_of`, `group_count`, `counts_peers`. Those of an equilibrium: `rest_of`, `start_of`. `LENGTH`, `ANGLES`.
@@ -93,15 +93,6 @@ class Graph:
 
 
 @dataclass(frozen=True, slots=True)
-class PairDelay:
-    """The delay of a link from one group of peers to another; `delay` is the name of a timing."""
-
-    sender: str
-    receiver: str
-    delay: str
-
-
-@dataclass(frozen=True, slots=True)
 class Loss:
     """The loss model of packets, netem's `gemodel` (after Gilbert and Elliott): names of four parameters.
 
@@ -136,19 +127,34 @@ class Channel:
 
 
 @dataclass(frozen=True, slots=True)
+class GroupPair:
+    """The packets of a link from the group `sender` to the group `receiver`; `delay` is the name of a timing.
+
+    With a `channel` of its own, the pair has a timing of its own, which identifies the channel. `channel` is
+    None for that of the link.
+    """
+
+    sender: str
+    receiver: str
+    delay: str
+    channel: Channel | None = None
+
+
+@dataclass(frozen=True, slots=True)
 class Link:
     """A network link, which transfers the values sent by every peer to the receivers.
 
-    `clock` is the name of a clock, `delay` of a timing; `delays` are the pairs of groups with other delays.
-    `channel` is None for a reliable link. `order` is "before" if a packet takes the values before the ticks
-    at its instant, "after" if it takes the values after them; such a packet is received at later ticks only.
+    `clock` is the name of a clock, `delay` of a timing; `pairs` are the pairs of groups with another delay or
+    channel. `channel` is None for a link without any unreliable pair. `order` is "before" if a packet takes
+    the values before the ticks at its instant, "after" if it takes the values after them; such a packet is
+    received at later ticks only.
     """
 
     name: str
     clock: str
     delay: str
     graph: Graph
-    delays: tuple[PairDelay, ...]
+    pairs: tuple[GroupPair, ...]
     channel: Channel | None = None
     order: str = "before"
 
@@ -156,6 +162,22 @@ class Link:
     def after(self) -> bool:
         """Whether a packet takes the values after the ticks at its instant."""
         return self.order == "after"
+
+    @property
+    def delays(self) -> tuple[str, ...]:
+        """The names of the timings of all delays, first the link's own."""
+        return self.delay, *(pair.delay for pair in self.pairs)
+
+    @property
+    def channels(self) -> tuple[Channel, ...]:
+        """The channels of the link and of its pairs, without repetition; empty for a reliable link."""
+        given = (self.channel, *(pair.channel for pair in self.pairs))
+        return tuple(channel for channel in given if channel is not None)
+
+    def channel_at(self, delay: str) -> Channel | None:
+        """Return the channel of the packets whose delay is the timing `delay`."""
+        named = (pair.channel for pair in self.pairs if pair.delay == delay and pair.channel)
+        return next(named, self.channel)
 
 
 @dataclass(frozen=True, slots=True)

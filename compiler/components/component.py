@@ -45,12 +45,13 @@ RESERVED = frozenset(
 # friction of the device, sampling period, delay of the loop, resolution of the position.
 SYMBOLS = ("K", "B", "b", "c", "T", "t_d", "D")
 # Roles of parameters that are no numbers: a clock or a link by name, or the description of a graph, delays,
-# losses, a trace or a table.
+# pairs of groups, losses, a trace or a table.
 ROLES = (
     "clock",
     "link",
     "graph",
     "delays",
+    "pairs",
     "loss",
     "trace",
     "table",
@@ -119,7 +120,7 @@ class Option:
 
 @dataclass(frozen=True, slots=True)
 class Reference:
-    """A parameter of a role: it names a clock or link, or describes a graph, delays, loss or a table."""
+    """A parameter of a role: it names a clock or link, or describes a graph, pairs, loss or a table."""
 
     name: str
     role: str
@@ -146,7 +147,7 @@ class SentValue:
 class PartBindings:
     """The entry of a part, in the names of the enclosing scope.
 
-    `described` has the nodes of parameters that describe a graph, delays, losses, a trace or a table.
+    `described` has the nodes of parameters that describe a graph, pairs, losses, a trace or a table.
     `connections` connect a connector to (part, connector); the part "ground" is fixed, an empty part is the
     enclosing component.
     """

@@ -1,7 +1,7 @@
 """The entries of parts, in a topology or inside a component, checked against their components.
 
 Takes: YAML mappings, the components, and the enclosing scope. Gives: `PartEntry`, `PartEntries`,
-`EntryScope`; `read_entry`, the `PartBindings` of an entry; `Definitions`, `component_named`,
+`EntryScope`; `read_entry`, the `PartBindings` of an entry; `read_option`; `Definitions`, `component_named`,
 `joining_of`.
 Guarantees: every number, option, reference and connection required by a component exists, or one error
 reports that it is missing.
@@ -338,6 +338,18 @@ class WrittenConnection:
     fix: str
 
 
+def read_option(node: Node, item: Option) -> str:
+    """Return the word of an option. Raises ApcError for an unknown word."""
+    name, words = item.name, item.words
+    word = value_of(node, name, words[0])
+    if word in words:
+        return word
+    close = _SYNONYMS.get(word.lower()) or nearest(word, words)
+    fix = f"{name}: {close}" if close in words else ""
+    expected = " or ".join(filter(None, (", ".join(words[:-1]), words[-1])))
+    raise fault("E206", node.location, name, expected, brief(word), fix)
+
+
 def read_entry(entry: PartEntry, scope: EntryScope, mistakes: Mistakes, index: int = 1) -> PartBindings:
     """Return the values, options, references, start values and connections of a part's entry.
 
@@ -403,22 +415,8 @@ def read_entry(entry: PartEntry, scope: EntryScope, mistakes: Mistakes, index: i
 
     def option(item: Option) -> str | None:
         """Return the word of an option, its default if missing. Raises ApcError for an unknown word."""
-        name, words, node = item.name, item.words, nodes.get(item.name)
-        if node is None:
-            return item.default
-        word = value_of(node, name, words[0])
-        if word in words:
-            return word
-        close = _SYNONYMS.get(word.lower()) or nearest(word, words)
-        fix = f"{name}: {close}" if close in words else ""
-        raise fault(
-            "E206",
-            node.location,
-            name,
-            " or ".join(filter(None, (", ".join(words[:-1]), words[-1]))),
-            brief(word),
-            fix,
-        )
+        node = nodes.get(item.name)
+        return item.default if node is None else read_option(node, item)
 
     def reference(item: Reference) -> str | None:
         """Return the name of a referenced clock, link or table; None if it is missing or only described."""

@@ -22,9 +22,9 @@ from apc.compiler.compiled import (
     Clock,
     Formula,
     Group,
+    GroupPair,
     Link,
     Loss,
-    PairDelay,
     Parameter,
     PeerColumn,
     PeerType,
@@ -43,8 +43,8 @@ from apc.compiler.language.expression import Expr, Name, format_expression
 from apc.compiler.language.unit_text import format_dimension
 from apc.compiler.language.values import ScalarValue, renamed
 from apc.compiler.peer_counts import COUNT_ABOUT, received_sums, with_received
+from apc.compiler.topology.channels import PROBABILITIES, ChannelDeclaration
 from apc.compiler.topology.groups import GroupDeclaration
-from apc.compiler.topology.links import PROBABILITIES
 from apc.compiler.topology.topology import Topology
 from apc.compiler.wording import enumerated
 
@@ -129,33 +129,27 @@ def used_links(topology: Topology, peer_types: Sequence[PeerType], timings: Timi
     }
     links = []
     for link in (link for link in topology.links if link.name in received):
-        pairs = ((delay, f"{link.name}.delays.{delay.sender}.{delay.receiver}") for delay in link.delays)
-        delays = tuple(
-            PairDelay(declared.sender, declared.receiver, timings.use(name, declared.delay))
-            for declared, name in pairs
-        )
-        delay, channel, channel_declaration = (
-            timings.use(f"{link.name}.delay", link.delay),
-            None,
-            link.channel,
-        )
-        if channel_declaration is not None:
-            loss = Loss(*(name for name, _ in channel_declaration.loss)) if channel_declaration.loss else None
-            jitter = (
-                None
-                if channel_declaration.jitter is None
-                else timings.use(f"{link.name}.jitter", channel_declaration.jitter)
+        pairs = tuple(
+            GroupPair(
+                pair.sender,
+                pair.receiver,
+                timings.use(pair.timing, pair.delay),
+                _channel(pair.channel, timings),
             )
-            channel = Channel(
-                loss,
-                jitter,
-                channel_declaration.distribution,
-                channel_declaration.reorder,
-                channel_declaration.on_loss,
-                channel_declaration.trace,
-            )
-        links.append(Link(link.name, link.clock, delay, link.graph, delays, channel, link.order))
+            for pair in link.pairs
+        )
+        delay, channel = timings.use(f"{link.name}.delay", link.delay), _channel(link.channel, timings)
+        links.append(Link(link.name, link.clock, delay, link.graph, pairs, channel, link.order))
     return tuple(links)
+
+
+def _channel(declared: ChannelDeclaration | None, timings: Timings) -> Channel | None:
+    """Return the channel of a declaration, whose jitter is added to the timings in use; None without one."""
+    if declared is None:
+        return None
+    loss = Loss(*(name for name, _ in declared.loss)) if declared.loss else None
+    jitter = None if declared.jitter is None else timings.use(*declared.jitter)
+    return Channel(loss, jitter, declared.distribution, declared.reorder, declared.on_loss, declared.trace)
 
 
 def used_clocks(
@@ -407,8 +401,8 @@ def all_parameters(
             parameters.append(
                 Parameter(count_of(link.name), "1", float(topology.peers - 1), description=COUNT_ABOUT)
             )
-        if link.channel is not None and link.name in used:
-            probabilities = zip(link.channel.loss, PROBABILITIES.values(), strict=False)
+        for channel in link.channels if link.name in used else ():
+            probabilities = zip(channel.loss, PROBABILITIES.values(), strict=False)
             parameters += [_named(*number, description, 0, 1) for number, description in probabilities]
     for clock in topology.clocks:
         if (name := f"{clock.name}.period") in needed:  # used by `interval`: the same number as the timing

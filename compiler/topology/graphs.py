@@ -1,7 +1,7 @@
-"""Communication graphs and delays between groups, from a link's entry.
+"""Communication graphs and pairs of groups, from a link's entry.
 
-Takes: the YAML nodes of `graph` and `delays`. Gives: `read_graph`, the `Graph` of a compiled model;
-`read_delays`, a `DelayDeclaration` per entry; `may_have_self_arcs`.
+Takes: the YAML nodes of `graph`, `pairs` and `delays`. Gives: `read_graph`, the `Graph` of a compiled model;
+`read_pairs`, the entries of pairs of groups; `is_connected`; `may_have_self_arcs`.
 Guarantees: every peer of an edge exists; weights are finite and not zero.
 Does not: build a matrix: a complete graph, a ring and a star are stored by name.
 """
@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -19,14 +19,13 @@ from apc.compiler.compiled import MOST_PLACED, Graph
 from apc.compiler.errors import Mistakes, SourceLocation
 from apc.compiler.files import InputFile
 from apc.compiler.language.csv_tables import open_table
-from apc.compiler.language.dimensions import SECOND
-from apc.compiler.language.values import AlreadyReportedError, ScalarValue
+from apc.compiler.language.values import AlreadyReportedError
 from apc.compiler.number_parsing import plain_float
 from apc.compiler.source import nodes
 from apc.compiler.source.nodes import Node, Scalar, Sequence
-from apc.compiler.source.reading import MappingReader, among, brief, fault, form, mapping_of, text_of, unknown
+from apc.compiler.source.reading import MappingReader, among, brief, fault, form, mapping_of, unknown
 from apc.compiler.topology.topology_parameters import NamedNumbers
-from apc.compiler.wording import with_unit
+from apc.compiler.weights import arcs
 
 SHAPES = ("complete", "ring", "star")
 
@@ -35,15 +34,6 @@ SYNONYMS_OF_COMPLETE = ("mesh", "full", "all", "clique")
 PAIRS = ("edges", "arcs")
 
 COMPLETE = Graph("complete", np.zeros((0, 2), np.int64), np.zeros(0))
-
-
-@dataclass(frozen=True, slots=True)
-class DelayDeclaration:
-    """The delay of a link from one group of peers, `sender`, to another, `receiver`."""
-
-    sender: str
-    receiver: str
-    delay: ScalarValue
 
 
 def read_graph(node: Node, numbers: NamedNumbers) -> Graph:
@@ -217,35 +207,60 @@ def _arc(pair: Node, subject: str, index_of: Mapping[str, int], mistakes: Mistak
     return ends[0], ends[1], weight
 
 
-def read_delays(node: Node, numbers: NamedNumbers) -> tuple[DelayDeclaration, ...]:
-    """Return the delays between pairs of groups that differ from the link's delay: `{SENDER: {RECEIVER:
-    12 ms}}`.
+def read_pairs(node: Node, key: str, value: str, numbers: NamedNumbers) -> list[tuple[str, str, Node]]:
+    """Return the entries of pairs of groups `{SENDER: {RECEIVER: VALUE}}`: sender, receiver, node of value.
 
     Parameters
     ----------
-    node
-        The YAML node of `delays`.
+    node, key
+        The YAML node, and its key.
+    value
+        An example of a value, for messages.
     numbers
-        The named numbers: groups of peers, reader of delays, collector of errors.
+        The named numbers: groups of peers, collector of errors.
 
     Raises
     ------
     ApcError
-        E203 the node is not a mapping; other mistakes are recorded.
+        E201 no entry, E203 the node is not a mapping; other mistakes are recorded.
     """
-    declarations, subject = [], "delays: unknown group of peers {}"
-    fix, counts = "delays: {left: {right: 12 ms}}", numbers.counts
-    for key, body in mapping_of(node, "delays", fix).entries:
+    entries, subject, counts = [], f"{key}: unknown group of peers {{}}", numbers.counts
+    first, *_, last = (*counts, *counts)
+    inner = f"{{{last}: {value}}}"
+    fix = f"{key}: {{{first}: {inner}}}"
+    for sender_key, body in _entries_of(node, key, fix):
         with numbers.mistakes:
-            sender = among(key.text, counts, key.location, subject)
-            for inner, value in mapping_of(body, sender, fix).entries:
+            sender = among(sender_key.text, counts, sender_key.location, subject)
+            for receiver_key, item in _entries_of(body, sender, f"{sender}: {inner}"):
                 with numbers.mistakes:
-                    receiver = among(inner.text, counts, inner.location, subject)
-                    text, message = text_of(value, receiver, fix), f"delay from {sender} to {receiver}"
-                    delay = numbers.read(value, message, SECOND, "ms")
-                    if delay.number < 0:
-                        least = with_unit("0", delay.unit or "s")
-                        right = "" if delay.expression else f"{receiver}: {text.strip().removeprefix('-')}"
-                        raise fault("E207", delay.location, message, f"{least} or more", str(delay), right)
-                    declarations.append(DelayDeclaration(sender, receiver, delay))
-    return tuple(declarations)
+                    receiver = among(receiver_key.text, counts, receiver_key.location, subject)
+                    entries.append((sender, receiver, item))
+    return entries
+
+
+def _entries_of(node: Node, subject: str, fix: str) -> tuple[tuple[Scalar, Node], ...]:
+    """Return the entries of a mapping that is not empty; raises ApcError (E201, E203) for other nodes."""
+    entries = mapping_of(node, subject, fix).entries
+    if not entries:
+        raise fault("E201", node.location, f"{subject}: no pair of groups is given", fix=fix)
+    return entries
+
+
+def is_connected(graph: Graph, sender: str, receiver: str, counts: Mapping[str, int]) -> bool:
+    """Return whether a graph connects a group to another one, or would connect it to itself with more peers.
+
+    Parameters
+    ----------
+    graph
+        The graph of a link.
+    sender, receiver
+        The names of the groups.
+    counts
+        The number of peers of each group.
+    """
+    if graph.shape == COMPLETE.shape or (sender == receiver and counts[sender] == 1):
+        return True
+    starts = np.cumsum([0, *counts.values()])
+    names, (pairs, _) = [*counts], arcs(graph, int(starts[-1]))
+    groups = np.searchsorted(starts, pairs, side="right") - 1
+    return bool((groups == [names.index(sender), names.index(receiver)]).all(axis=1).any())

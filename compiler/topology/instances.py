@@ -35,7 +35,7 @@ from apc.compiler.source.reading import among, fault, form, text_of
 from apc.compiler.topology.graphs import may_have_self_arcs
 from apc.compiler.topology.topology_parameters import NamedNumbers
 
-LINK_ROLES = ("graph", "delays", "loss", "trace")
+LINK_ROLES = ("graph", "delays", "pairs", "loss", "trace")
 
 # The settable names: for each written name its type and its qualified names.
 SettableNames = Mapping[str, tuple[Settable, list[str]]]

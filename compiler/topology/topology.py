@@ -28,9 +28,10 @@ from apc.compiler.language.values import AlreadyReportedError, ScalarValue
 from apc.compiler.source.nodes import Mapping, Scalar, Sequence
 from apc.compiler.source.reading import MappingReader, brief, fault, first_use, mapping_of, text_of
 from apc.compiler.source.source import Source
+from apc.compiler.topology.channels import PROBABILITY
 from apc.compiler.topology.groups import GroupDeclaration, GroupReader, read_counts
 from apc.compiler.topology.instances import PartInstance, PartReader, settable_names
-from apc.compiler.topology.links import PROBABILITY, LinkDeclaration, read_link, without_range
+from apc.compiler.topology.links import LinkDeclaration, read_link, without_range
 from apc.compiler.topology.redeclarations import redeclared
 from apc.compiler.topology.studies import read_experiment, read_studies
 from apc.compiler.topology.timebase import ClockDeclaration, read_clocks
@@ -215,9 +216,10 @@ def build_topology(source: Source, library: Library) -> Topology:
     groups = tuple(group_reader.read(group) for group in bodies.values())
     settable = settable_names(parts)
     for link in links:  # a loss probability is settable unless it depends on other numbers
-        for name, value in link.channel.loss if link.channel is not None else ():
-            if value.expression is None:
-                settable[name] = PROBABILITY, [name]
+        for channel in link.channels:
+            settable |= {
+                name: (PROBABILITY, [name]) for name, value in channel.loss if value.expression is None
+            }
     experiment = read_experiment(root, numbers)
     region, tune = read_studies(root, settable, numbers, names.is_reported)
     name, description = (visible(root.text(key)) for key in ("topology", "description"))

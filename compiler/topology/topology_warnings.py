@@ -7,7 +7,7 @@ Does not: analyze equations, or change the topology.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -26,7 +26,7 @@ def topology_warnings(
     parts: Sequence[PartInstance],
     links: Sequence[LinkDeclaration],
     entries: Mapping[str, PartEntry],
-    groups: Iterable[GroupDeclaration],
+    groups: Sequence[GroupDeclaration],
     replaced: Mapping[str, Path],
 ) -> tuple[Diagnostic, ...]:
     """Return the warnings about a topology, in the order of its file.
@@ -56,6 +56,7 @@ def topology_warnings(
             )
             message += "; simulate and export need a single delay"
             warnings.add("W275", entry.location, message)
+    counts = {group.name: group.count for group in groups}
     for link in links:
         if link.channel is not None and link.channel.loses_all:
             loss = entries[link.name].body.get("loss")
@@ -63,13 +64,20 @@ def topology_warnings(
             fix = "loss: 1 %" if isinstance(loss, Scalar) and isinstance(loss.value, int | float) else ""
             message = f"every packet of {link.name} is lost, so no packet ever arrives"
             warnings.add("W277", location, message, fix=fix)
+        for pair in link.pairs:
+            name = f"{link.name} from {pair.sender} to {pair.receiver}"
+            if pair.channel is not None and pair.channel.loses_all:
+                message = f"every packet of {name} is lost, so no packet ever arrives"
+                warnings.add("W277", pair.location, message)
+            if pair.sender == pair.receiver and counts[pair.sender] == 1:
+                message = f"no packet of {name} is sent, as {pair.sender} has one peer"
+                warnings.add("W278", pair.location, message)
     outer = [part for part in parts if part.name.partition("[")[0] in entries and "." not in part.name]
     for part in {part.component.name: part for part in reversed(outer)}.values():
         if part.component.name in replaced:
             file = replaced[part.component.name].name
             message = f"{part.component.name} is defined in {file} and replaces the component of the library"
             warnings.add("W276", part.location, message)
-    counts = {group.name: group.count for group in groups}
     connected = {group: _joined([part for part in outer if group in part.groups]) for group in counts}
     receiving = {part.name: part for part in outer if part.component.receives_from_others}
     masses = [part for part in outer if part.section == "masses"]

@@ -23,6 +23,7 @@ from apc.compiler.language.dimensions import SECOND
 from apc.compiler.language.expression import format_expression
 from apc.compiler.language.values import ScalarValue
 from apc.compiler.language.vectors import by_vector, whole_and_index
+from apc.compiler.topology.channels import ChannelDeclaration
 from apc.compiler.topology.instances import PartInstance
 from apc.compiler.topology.links import LinkDeclaration
 from apc.compiler.topology.topology import Topology
@@ -185,11 +186,21 @@ def seconds(number: Fraction) -> str:
 
 def _link_box(link: LinkDeclaration) -> Box:
     """Return the box of a link, with its graph, clock, delays and channel."""
-    delay, remarks = link.delay.number, () if link.channel is None else link.channel.remarks
+    delay = link.delay.number
     later = f"delay {seconds(delay)}" if delay else "no delay"
     lines = (link.name, shape_of(link), f"one packet per tick of {link.clock}", later)
-    delays = (f"{d.sender} to {d.receiver}: delay {seconds(d.delay.number)}" for d in link.delays)
-    return Box(f"link {link.name}", "link", (*lines, *delays, *remarks), link.clock)
+    pairs = (
+        ", ".join(
+            (f"{pair.sender} to {pair.receiver}: delay {seconds(pair.delay.number)}", *_remarks(pair.channel))
+        )
+        for pair in link.pairs
+    )
+    return Box(f"link {link.name}", "link", (*lines, *pairs, *_remarks(link.channel)), link.clock)
+
+
+def _remarks(channel: ChannelDeclaration | None) -> tuple[str, ...]:
+    """Return the remarks on a channel, none without one."""
+    return () if channel is None else channel.remarks
 
 
 def _group_boxes(topology: Topology) -> Iterator[Box]:

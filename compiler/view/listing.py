@@ -230,7 +230,7 @@ def schedule(system: Model) -> dict[str, Any]:
             for link in system.links
             for sender, receiver, delay in (
                 ("", "", link.delay),
-                *((pair.sender, pair.receiver, pair.delay) for pair in link.delays),
+                *((pair.sender, pair.receiver, pair.delay) for pair in link.pairs),
             )
         ],
         "receives": [

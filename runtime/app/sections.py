@@ -240,10 +240,13 @@ def _network(numeric: NumericModel, _: None) -> Plain:
     verdict = mean_square_stability(numeric)
     texts = ["Every packet is on time." if verdict is None else str(verdict)]
     for link in links:
-        assert link.channel is not None
-        loss, jitter = link.channel.loss, link.channel.jitter
-        names = [loss.p if loss else None, jitter]
-        texts += [_critical(system, name) for name in names if name is not None]
+        names = [
+            name
+            for channel in link.channels
+            for name in (channel.loss and channel.loss.p, channel.jitter)
+            if name
+        ]
+        texts += [_critical(system, name) for name in dict.fromkeys(names)]
     return {"text": "\n\n".join(texts)}
 
 

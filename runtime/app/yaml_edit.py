@@ -146,10 +146,10 @@ def _shown(number: Any) -> str:
 def _numbers(system: Model) -> dict[str, Any]:
     """Return every exact number of a model by name and group, as a tuple if it differs between peers."""
     # The name of a single loss probability changes if another number of the loss model is given.
-    losses = [(link.name, link.channel.loss) for link in system.links if link.channel is not None]
+    losses = [channel.loss for link in system.links for channel in link.channels]
     lost = {
-        getattr(loss, item.name): f"{link}.loss {item.name}"
-        for link, loss in losses
+        getattr(loss, item.name): f"{loss.r.removesuffix('.r')} {item.name}"
+        for loss in losses
         if loss is not None
         for item in fields(loss)
     }

@@ -184,7 +184,7 @@ def _simulate_single(system: Model, how: Settings, stored: _StoredRows, *, as_js
     if moving is not None and stored.signals:
         raise click.UsageError(f"--signals can't be combined with an animation ({moving.suffix})")
     simulation = prepare(system, how, signals=stored.signals)
-    if any(link.channel and (link.channel.loss or link.channel.jitter) for link in system.links):
+    if any(channel.loss or channel.jitter for link in system.links for channel in link.channels):
         note_aside(f"packet losses and delays are random, seed {simulation.seed}; statistics: --runs 100")
     keeper = Keeper(simulation) if stored.plot is not None or moving is not None else None
     comparison = compare_with(simulation, signals=stored.signals) if stored.error else None

@@ -1,5 +1,13 @@
-% set law = link.arrival_process.law
-% set trace = [] if law.trace is none else law.trace.tolist()
+% set trace = [] if link.laws[0].trace is none else link.laws[0].trace.tolist()
+static const struct {
+  double bad, bad_loses, good_loses, p, r, jitter;
+  int distribution, zero; /* zero: a lost packet is reported as missing */
+} ${link.name}_laws[] = {
+% for law in link.laws
+  {${law.bad | number}, ${law.one_minus_h | number}, ${law.one_minus_k | number}, ${law.p | number}, ${law.r | number}, ${law.jitter | number}, ${law.distribution | upper}, ${law.zero | int}},
+% endfor
+};
+static const int ${link.name}_law_of[${link.arcs | length or 1}] = {${link.law_of | row}};
 static const whole ${link.name}_senders[${link.arcs | length or 1}] = {${link.arcs | map("first") | row}};
 static const whole ${link.name}_receivers[${link.arcs | length or 1}] = {${link.arcs | map("last") | row}};
 
@@ -23,15 +31,17 @@ static void draw_${link.name}(model *m, int sender, long long number) {
     ${link.name}_arc *arc = &m->arcs_${link.name}[w];
     ${link.name}_coming *one = &arc->coming[number % ${link.stored}];
     if (${link.name}_senders[w] != sender) continue;
+    const int law = ${link.name}_law_of[w];
     double u[4], late = seconds[w];
     if (number == 0) {
       chances(1, key[0], key + 1, 1, ${link.name}_senders + w, ${link.name}_receivers + w, &u);
-      arc->bad = u[0] < ${law.bad | number};
+      arc->bad = u[0] < ${link.name}_laws[law].bad;
     }
     chances(1, key[0], key + 1, number + 2, ${link.name}_senders + w, ${link.name}_receivers + w, &u);
-    int lost = u[1] < (arc->bad ? ${law.one_minus_h | number} : ${law.one_minus_k | number});
-    arc->bad = arc->bad ? u[0] < 1 - ${law.r | number} : u[0] < ${law.p | number};
-    if (${law.jitter | number} > 0) late += ${law.jitter | number} * deviate(${law.distribution | upper}, u[2], u[3]);
+    int lost = u[1] < (arc->bad ? ${link.name}_laws[law].bad_loses : ${link.name}_laws[law].good_loses);
+    arc->bad = arc->bad ? u[0] < 1 - ${link.name}_laws[law].r : u[0] < ${link.name}_laws[law].p;
+    if (${link.name}_laws[law].jitter > 0)
+      late += ${link.name}_laws[law].jitter * deviate(${link.name}_laws[law].distribution, u[2], u[3]);
     if (late < 0) late = 0;
     if (${1 if trace else 0}) {
       late = trace[number % ${trace | length or 1}];
@@ -62,7 +72,7 @@ static const double *received_${link.name}(model *m, int w, long long at, int *m
     }
     one->state = 0;
   }
-  *missing = arc->gap > arc->effective;
+  *missing = arc->gap > arc->effective && ${link.name}_laws[${link.name}_law_of[w]].zero;
   return arc->held;
 }
 

@@ -481,8 +481,8 @@ class _Peer:
 
 def _refuse_unsupported(system: Model, exchange: CommunicationGraph) -> None:
     """Raise ApcError E955 for constructs that Modelica equations cannot express."""
-    for link, law in unreliable(system):
-        message = f"{chance(link, law)}: random packet loss or delay"
+    for _, law in unreliable(system):
+        message = f"{chance(law)}: random packet loss or delay"
         raise _refused(system, message, "use a reliable link, or apc simulate")
     for link in system.links:
         if link.after:

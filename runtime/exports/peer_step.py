@@ -559,7 +559,6 @@ def lines_of(
             message = f"{exchange.peer_name(number)} receives from {len(senders):,} peers over {link}"
             message = f"{message}; the limit of the C export is {MOST_RECEIVED:,}"
             raise refused(system, message, advice="reduce the number of peers, or use a sparse graph")
-        law = declared.channel
         lines.append(
             PeerLink(
                 link=link,
@@ -574,7 +573,7 @@ def lines_of(
                     )
                     for sender, weight in senders
                 ),
-                missing=law is not None and law.on_loss == "zero" and bool(senders),
+                missing=bool(senders) and any(channel.on_loss == "zero" for channel in declared.channels),
                 complete=exchange.is_complete(link),
             )
         )

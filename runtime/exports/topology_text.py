@@ -32,7 +32,7 @@ from apc.exports.peer_step import (
     refused,
     subsystems_of,
 )
-from apc.network.channel import stream_key
+from apc.network.channel import ChannelLaw, channel_law, stream_key
 from apc.network.packet_schedule import ArrivalProcess, arrival_process_of
 from apc.simulation.settings import Method
 from apc.simulation.simulation import SimulationPlan
@@ -66,8 +66,9 @@ class CLink:
 
     `ring` packets of each peer are stored; `start` (peers, channels) are the values used before the first
     packet arrives. `arcs` are (sender, receiver), grouped by receiver in order of reception; `delays` are the
-    delays of these, in s. `arrival_process` is None for a reliable link; otherwise `key` is its random-stream
-    key, and up to `stored` packets per pair are stored.
+    delays of these, in s. `arrival_process` is None for a reliable link; otherwise `laws` are its channel
+    laws and `law_of` the index of each pair's law, `key` is its random-stream key, and up to `stored` packets
+    per pair are stored.
     """
 
     link: str
@@ -80,6 +81,8 @@ class CLink:
     arcs: tuple[tuple[int, int], ...]
     delays: tuple[Fraction, ...]
     arrival_process: ArrivalProcess | None
+    laws: tuple[ChannelLaw, ...]
+    law_of: tuple[int, ...]
     key: tuple[int, int]
     stored: int
 
@@ -202,12 +205,11 @@ def _links(plan: SimulationPlan, quantum: Fraction) -> tuple[CLink, ...]:
     clocks = {clock.name: clock for clock in plan.system.clocks}
     links = []
     for name, (link, channels) in zip(prefixed("link", used), used.items(), strict=True):
-        clock = clocks[exchange.links[link].clock]
+        names = [exchange.delay(link, *map(exchange.group_of, arc)) for arc in arcs[link]]
+        delays, distinct = [timings[name] for name in names], [*dict.fromkeys(names)]
+        declared = exchange.links[link]
+        clock = clocks[declared.clock]
         period, phase = (int(timings[text] / quantum) for text in (clock.period, clock.phase))
-        delays = [
-            timings[exchange.delay(link, *(exchange.group_of(number) for number in arc))]
-            for arc in arcs[link]
-        ]
         arrival_processes = [
             (arrival_process_of(plan.system, timings, exchange, route, quantum), route)
             for route in plan.routes
@@ -229,6 +231,10 @@ def _links(plan: SimulationPlan, quantum: Fraction) -> tuple[CLink, ...]:
                 arcs=tuple(arcs[link]),
                 delays=tuple(delays),
                 arrival_process=arrival_processes[0][0] if arrival_processes else None,
+                laws=tuple(channel_law(plan.system, declared, name) for name in distinct)
+                if arrival_processes
+                else (),
+                law_of=tuple(map(distinct.index, names)),
                 key=stream_key(link, plan.system.experiment.seed, 0),
                 stored=stored,
             )

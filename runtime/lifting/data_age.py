@@ -59,7 +59,7 @@ def linear_subsystems(
 
 def of_single_delay(system: Model) -> Model:
     """Return a model in which all pairs have the delay of their link, so that each tick has one age."""
-    return replace(system, links=tuple(replace(link, delays=()) for link in system.links))
+    return replace(system, links=tuple(replace(link, pairs=()) for link in system.links))
 
 
 def at_timings(

@@ -61,7 +61,7 @@ Matrix = NDArray[Any]
 Flags = NDArray[np.bool_]
 
 # No loss probability has an error.
-EXACTLY: Mapping[str, tuple[float, ...]] = {}
+EXACTLY: Mapping[Route, tuple[float, ...]] = {}
 
 # A link on which every packet takes the nominal delay.
 PERFECT = ChannelLaw(0.0, 1.0, 0.0, 0.0, 0.0, 0.0, "uniform", None)
@@ -503,7 +503,7 @@ def stored_of(
     common: ModalSystem,
     *,
     perfect: bool = False,
-    lost: Mapping[str, tuple[float, ...]] = EXACTLY,
+    lost: Mapping[Route, tuple[float, ...]] = EXACTLY,
 ) -> list[RouteMemory]:
     """Return the receiver memory of each route that affects an output.
 
@@ -516,8 +516,8 @@ def stored_of(
     perfect
         Whether every packet arrives with its nominal delay.
     lost
-        The error bound of a link's loss probability and its change over a cell, by the name of the link, as
-        for `receiver_memory.memory_of`.
+        The error bound of a route's loss probability and its change over a cell, by route, as for
+        `receiver_memory.memory_of`.
     """
     received: dict[Route, list[UncertainSample]] = {}
     for subsystem, rows in zip(common.subsystems, reception.of(common), strict=True):
@@ -533,8 +533,8 @@ def stored_of(
         link, delay = links[route[0]], reception.timings[route[1]]
         sent = times[link.clock]
         ticks = {(row.clock, row.tick): times[row.clock][row.tick] for row in selected}
-        law = PERFECT if perfect or link.channel is None else channel_law(system, link, delay)
-        error_bound = lost.get(route[0], (0.0,))
+        law = PERFECT if perfect or link.channel is None else channel_law(system, link, route[1])
+        error_bound = lost.get(route, (0.0,))
         memory = memory_of(
             law,
             delay,

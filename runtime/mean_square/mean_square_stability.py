@@ -182,10 +182,7 @@ def independent_channels(system: Model) -> bool:
     """Return whether all packets are lost or delayed independently, a lost one being replaced by the last."""
     lossy = unreliable(system)
     return not _reason_not_supported(system, lossy) and all(
-        law.trace is None
-        and is_memoryless(law)
-        and (not law.mean_loss or (link.channel is not None and link.channel.on_loss == "hold"))
-        for link, law in lossy
+        law.trace is None and is_memoryless(law) and not (law.mean_loss and law.zero) for _, law in lossy
     )
 
 
@@ -242,25 +239,21 @@ def _reason_not_supported(system: Model, lossy: Sequence[tuple[Link, ChannelLaw]
             return "recorded delays together with random loss or jitter of another link"
         if any(law.trace is not None and not np.isfinite(law.trace).any() for _, law in lossy):
             return "the trace has only losses"
-        if any(
-            link.channel is not None and link.channel.on_loss == "zero"
-            for link, law in lossy
-            if law.mean_loss
-        ):
+        if any(law.mean_loss and law.zero for _, law in lossy):
             return "recorded losses with on_loss: zero"
         return ""
     for link, law in lossy:
         assert link.channel is not None
         if law.r == 0 and law.p and not is_memoryless(law):
-            return f"bursts of {link.name} without end (r = 0), so eventually every packet is lost"
+            return f"bursts of {law.label} without end (r = 0), so eventually every packet is lost"
         if law.mean_loss >= 1:
-            return f"every packet of {link.name} is lost, so the received values never change"
-        if law.jitter and law.mean_loss and link.channel.on_loss == "zero":
-            return f"jitter and losses of {link.name} together with on_loss: zero"
+            return f"every packet of {law.label} is lost, so the received values never change"
+        if law.jitter and law.mean_loss and law.zero:
+            return f"jitter and losses of {law.label} together with on_loss: zero"
         if law.jitter and not is_memoryless(law):
-            return f"jitter and bursts of {link.name} together"
+            return f"jitter and bursts of {law.label} together"
         if law.jitter and link.channel.reorder == "all" and _overtakes(system, link, law):
-            return f"reordered packets of {link.name} that are accepted (reorder: all)"
+            return f"reordered packets of {law.label} that are accepted (reorder: all)"
     return ""
 
 

@@ -3,9 +3,9 @@
 Takes: a link's `Channel` and the model's parameter values; the peer pair of each directed link; a seed.
 Gives: `ChannelLaw`, `channel_law`, `LATEST`; `deviates`, the jitter's distributions; `PacketSource`, the
 packet delays; `stream_key`, the key of a random stream.
-Guarantees: one law for all directed links of a network link with one delay. Equal seeds give equal packets.
-The result is independent of the order of the directed links, of other links, of the partition of time into
-calls, and of the NumPy version. Directed links are statistically independent.
+Guarantees: one law for all directed links of a network link with one timing as delay. Equal seeds give equal
+packets. The result is independent of the order of the directed links, of other links, of the partition of
+time into calls, and of the NumPy version. Directed links are statistically independent.
 Does not: handle packet contents, or select the packets in effect at a tick (see `packet_schedule`).
 
 The random numbers of packet k of a directed link are block k + 2 of the stream `numpy.random.Philox` with the
@@ -23,7 +23,6 @@ from __future__ import annotations
 import math
 import zlib
 from dataclasses import dataclass
-from fractions import Fraction
 from typing import Any
 
 import numpy as np
@@ -55,7 +54,8 @@ class ChannelLaw:
     """The parameters of a channel.
 
     `p`, `r`, `one_minus_h` and `one_minus_k` are netem's `gemodel` (see `compiled.Loss`); `delay` and
-    `jitter` are in seconds; `trace` (n,) replaces all of them: seconds, infinite for a lost packet.
+    `jitter` are in seconds; `trace` (n,) replaces all of them: seconds, infinite for a lost packet. `zero`
+    states whether the receiver substitutes its own value for a lost packet; `label` names the directed links.
     """
 
     p: float
@@ -66,6 +66,8 @@ class ChannelLaw:
     jitter: float
     distribution: str
     trace: Floats | None
+    zero: bool = False
+    label: str = ""
 
     @property
     def bad(self) -> float:
@@ -87,8 +89,8 @@ class ChannelLaw:
         return self.delay + self.jitter * LATEST[self.distribution]
 
 
-def channel_law(system: Model, link: Link, delay: Fraction) -> ChannelLaw:
-    """Return the parameters of a link's channel, for the present values of the model.
+def channel_law(system: Model, link: Link, delay: str) -> ChannelLaw:
+    """Return the parameters of the channel of a link or of a pair of groups, for the model's present values.
 
     Parameters
     ----------
@@ -97,14 +99,14 @@ def channel_law(system: Model, link: Link, delay: Fraction) -> ChannelLaw:
     link
         A link of the model that has a channel.
     delay
-        The delay of the directed link, in seconds.
+        The timing of the delay of the directed links, which identifies their channel.
 
     Raises
     ------
     ApcError
         E891 a group of peers sets its own value for a link parameter.
     """
-    channel = link.channel
+    channel = link.channel_at(delay)
     assert channel is not None, f"{link.name} is reliable"
     loss = (
         ()
@@ -121,8 +123,22 @@ def channel_law(system: Model, link: Link, delay: Fraction) -> ChannelLaw:
     seconds = {timing.name: float(timing.value) for timing in system.timings}
     p, r, one_minus_h, one_minus_k = (value[name] for name in loss) if loss else (0.0, 1.0, 1.0, 0.0)
     jitter = 0.0 if channel.jitter is None else seconds[channel.jitter]
+    of_pairs = (
+        f"{link.name} from {pair.sender} to {pair.receiver}"
+        for pair in link.pairs
+        if pair.delay == delay and pair.channel is not None
+    )
     return ChannelLaw(
-        p, r, one_minus_h, one_minus_k, float(delay), jitter, channel.distribution, channel.trace
+        p,
+        r,
+        one_minus_h,
+        one_minus_k,
+        seconds[delay],
+        jitter,
+        channel.distribution,
+        channel.trace,
+        channel.on_loss == "zero",
+        next(of_pairs, link.name),
     )
 
 

@@ -17,22 +17,25 @@ from apc.compiler.compiled import Link, Model
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.network.channel import ChannelLaw, channel_law
 from apc.parameter_values.parameter_names import ParameterRef, given_ranges, unit_of
-from apc.parameter_values.parameters import resolve, scope_of
+from apc.parameter_values.parameters import scope_of
 
 
 def unreliable(system: Model) -> list[tuple[Link, ChannelLaw]]:
-    """Return the links with random loss, jitter or recorded delays, with their channel laws."""
-    links = [link for link in system.links if link.channel is not None]
-    timings = resolve(system).timings if links else {}
-    laws = [(link, channel_law(system, link, timings[link.delay])) for link in links]
+    """Return the links with random loss, jitter or recorded delays, with each of their channel laws."""
+    laws = [
+        (link, channel_law(system, link, delay))
+        for link in system.links
+        if link.channel is not None
+        for delay in (link.delay, *(pair.delay for pair in link.pairs if pair.channel is not None))
+    ]
     return [(link, law) for link, law in laws if law.mean_loss or law.jitter or law.trace is not None]
 
 
-def chance(link: Link, law: ChannelLaw) -> str:
-    """Return a description of a link's loss, jitter and recorded delays."""
+def chance(law: ChannelLaw) -> str:
+    """Return a description of the loss, jitter and recorded delays of directed links."""
     named = [f"packet loss ({100 * law.mean_loss:.3g} %)"] * bool(law.mean_loss)
     named += ["jitter"] * bool(law.jitter) + ["recorded delays"] * (law.trace is not None)
-    return f"{' and '.join(named)} of {link.name}"
+    return f"{' and '.join(named)} of {law.label}"
 
 
 def limitations(
@@ -50,9 +53,9 @@ def limitations(
         The varied timings; a range of these is not a limitation.
     """
     notes = []
-    for link, law in unreliable(system) if network else ():
-        delay = _ms(resolve(system).timings[link.delay])
-        notes.append(f"excluded: {chance(link, law)}; every packet has the nominal delay of {delay}")
+    for _, law in unreliable(system) if network else ():
+        delay = _ms(Fraction(law.delay))
+        notes.append(f"excluded: {chance(law)}; every packet has the nominal delay of {delay}")
     names = {parameter_ref.name for parameter_ref in varied}
     for interval in given_ranges(system):
         if interval.free.name not in names:
@@ -91,11 +94,10 @@ def channel_numbers(system: Model) -> frozenset[str]:
     """Return the names of the parameters of all channels, and of all numbers that these depend on."""
     texts: list[str] = []
     for link in system.links:
-        if link.channel is not None and link.channel.loss is not None:
-            loss = link.channel.loss
-            texts += [loss.p, loss.r, loss.one_minus_h, loss.one_minus_k]
-        if link.channel is not None and link.channel.jitter is not None:
-            texts.append(link.channel.jitter)
+        for channel in link.channels:
+            loss, jitter = channel.loss, channel.jitter
+            texts += [loss.p, loss.r, loss.one_minus_h, loss.one_minus_k] if loss else []
+            texts += [jitter] if jitter else []
     return frozenset(scope_of(system).needed(texts))
 
 

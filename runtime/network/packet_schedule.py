@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from fractions import Fraction
 
 import numpy as np
@@ -55,7 +55,7 @@ class Route:
     `pairs` (M, 2) are the peers (sender, receiver), counted from 0, receiver by receiver, `weights` (M,) the
     graph's weights; `longest` is the link's longest time in seconds from a packet's sample to its arrival. A
     frame has `ticks` ticks of the clock and `slots` sending slots of the link; packets are stored for
-    `frames` frames. `zero` states whether the receiver substitutes its own value for a missing sample.
+    `frames` frames. `zero` states whether a receiver substitutes its own value for a missing sample.
     """
 
     link: str
@@ -74,8 +74,8 @@ class DeliveredPackets:
     """The packets in effect at the ticks on M directed links.
 
     `packets` (ticks, M) are the numbers of the packets in effect, counted from 0, `START` for the start
-    values. `missing` (ticks, M) marks detected losses: from the nominal arrival tick of a lost packet until a
-    packet sent after it is in effect.
+    values. `missing` (ticks, M) marks detected losses for which the receiver substitutes its own value: from
+    the nominal arrival tick of a lost packet until a packet sent after it is in effect.
     """
 
     packets: Integers
@@ -86,13 +86,13 @@ class DeliveredPackets:
 class ArrivalProcess:
     """The arrival process of a route's directed links; times in quanta of `quantum` seconds.
 
-    `law` is the channel law common to all directed links except for their `delays` (M,) in seconds; `nominal`
-    (M,) are these delays in quanta. Packet k is sent at phase + k*period, tick k is at tick_phase +
-    k*tick_period. `newest` and `least` as in `LinkReceiver`.
+    `laws` are the channel laws, one per delay of pairs of groups, and `law_of` (M,) the index of each
+    directed link's law; `nominal` (M,) are the delays in quanta. Packet k is sent at phase + k*period, tick k
+    is at tick_phase + k*tick_period. `newest` and `least` as in `LinkReceiver`.
     """
 
-    law: ChannelLaw
-    delays: Floats
+    laws: tuple[ChannelLaw, ...]
+    law_of: Integers
     nominal: Integers
     phase: int
     period: int
@@ -102,13 +102,19 @@ class ArrivalProcess:
     newest: bool
     least: int
 
+    @property
+    def zero(self) -> Flags:
+        """Whether the receiver of each directed link substitutes its own value for a missing sample (M,)."""
+        return np.array([law.zero for law in self.laws], np.bool_)[self.law_of]
+
     def stored(self, route: Route) -> int:
         """Return an upper bound of the number of packets stored for each directed link."""
         return route.slots * (self.latest(route) // (route.ticks * self.tick_period) + 3)
 
     def latest(self, route: Route) -> int:
         """Return the time in quanta after which a packet of a directed link has arrived or is lost."""
-        return math.ceil(max(route.longest, float(self.delays.max(initial=0.0))) / float(self.quantum)) + 1
+        longest = max((law.delay for law in self.laws), default=0.0)
+        return math.ceil(max(route.longest, longest) / float(self.quantum)) + 1
 
 
 def arrival_process_of(
@@ -147,13 +153,13 @@ def arrival_process_of(
     }
     groups, group_pair_of = _group_pairs(exchange, route.pairs)
     least = int(link.after)
-    group_delays = [timings[exchange.delay(link.name, *pair)] for pair in groups]
+    pair_delays = [exchange.delay(link.name, *pair) for pair in groups]
+    delays = [*dict.fromkeys(pair_delays)]
+    law_of = np.array([delays.index(delay) for delay in pair_delays], np.int64)[group_pair_of]
     arrival_process = ArrivalProcess(
-        law=channel_law(system, link, timings[link.delay]),
-        delays=np.array([float(number) for number in group_delays])[group_pair_of],
-        nominal=np.array([max(int(number / quantum), least) for number in group_delays], np.int64)[
-            group_pair_of
-        ],
+        laws=tuple(channel_law(system, link, delay) for delay in delays),
+        law_of=law_of,
+        nominal=np.array([max(int(timings[delay] / quantum), least) for delay in delays], np.int64)[law_of],
         phase=int(grids[link.clock][0]),
         period=int(grids[link.clock][1]),
         tick_phase=int(grids[route.clock][0]),
@@ -354,7 +360,10 @@ class Timetable:
             missing = np.empty(packets.shape, np.bool_)
             for arcs, receiver in receivers:
                 received = receiver.receive(ticks)
-                packets[:, arcs], missing[:, arcs] = received.packets, received.missing
+                packets[:, arcs], missing[:, arcs] = (
+                    received.packets,
+                    received.missing & receiver.source.law.zero,
+                )
             delivered.append(DeliveredPackets(packets, missing))
         self._now = until
         return tuple(delivered)
@@ -363,16 +372,15 @@ class Timetable:
 def _link_receivers(
     route: Route, arrival_process: ArrivalProcess, seed: int, run: int
 ) -> list[tuple[Integers, LinkReceiver]]:
-    """Return a receiver for each distinct delay of a route, with the indices of its directed links."""
+    """Return a receiver for each channel law of a route, with the indices of its directed links."""
     pairs = []
-    for nominal in np.unique(arrival_process.nominal).tolist():
-        arcs = np.flatnonzero(arrival_process.nominal == nominal)
-        law = replace(arrival_process.law, delay=float(arrival_process.delays[arcs[0]]))
+    for index, law in enumerate(arrival_process.laws):
+        arcs = np.flatnonzero(arrival_process.law_of == index)
         receiver = LinkReceiver(
             PacketSource(law, route.link, route.pairs[arcs], seed=seed, run=run),
             phase=arrival_process.phase,
             period=arrival_process.period,
-            delay=nominal,
+            delay=int(arrival_process.nominal[arcs[0]]),
             quantum=arrival_process.quantum,
             newest=arrival_process.newest,
             least=arrival_process.least,
@@ -411,8 +419,7 @@ def _routes_over(
     link: Link,
 ) -> list[Route]:
     """Return the routes of a link: its directed links, grouped by the clock of their receivers."""
-    peers, channel = exchange.peers, link.channel
-    assert channel is not None, f"{link.name} is reliable"
+    peers = exchange.peers
     if link.graph.shape == "complete" and peers * (peers - 1) > MOST_ARCS:
         message = (
             f"{link.name} is unreliable; {peers} completely connected peers have "
@@ -433,7 +440,7 @@ def _routes_over(
         if arcs.any():
             used[clock.name] = pairs[arcs], weights[arcs]
     groups = {pair for clock_pairs, _ in used.values() for pair in _group_pairs(exchange, clock_pairs)[0]}
-    delays = {timings[exchange.delay(link.name, *pair)] for pair in groups}
+    delays = {exchange.delay(link.name, *pair) for pair in groups}
     longest = max((channel_law(system, link, delay).longest for delay in delays), default=0.0)
     periods = {clock.name: timings[clock.period] for clock in system.clocks}
     return [
@@ -447,7 +454,7 @@ def _routes_over(
             slots=int(frame_s / periods[link.clock]),
             # A packet is received at most one tick after it arrives, and a clock ticks in every frame.
             frames=math.ceil(longest / float(frame_s)) + 1,
-            zero=channel.on_loss == "zero",
+            zero=any(channel.on_loss == "zero" for channel in link.channels),
         )
         for clock, (clock_pairs, clock_weights) in used.items()
     ]

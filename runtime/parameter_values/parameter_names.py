@@ -323,8 +323,10 @@ def values_by_group(system: Model, parameter_ref: ParameterRef) -> tuple[tuple[s
 
 def _time_notes(system: Model, parameter_ref: ParameterRef) -> Iterator[str]:
     """Yield a note for each link or clock whose time does not apply to all groups."""
+    formulas = {timing.name: timing.formula for timing in system.timings}
     for link in system.links:
-        others = [pair.delay for pair in link.delays]
+        pairs = [(pair.delay, formulas[pair.delay]) for pair in link.pairs]
+        others = [name for name, formula in pairs if formula is None or link.delay not in formula.names]
         if parameter_ref.name == link.delay and others:
             yield f"{parameter_ref.name} applies to all pairs of groups except those of {', '.join(others)}"
     for clock in system.clocks:

@@ -67,10 +67,7 @@ AT_ONCE = 32
 def live_topology(system: Model) -> Model:
     """Return a model whose links receive packets as they arrive on the real network."""
     timings = {timing.name: timing.value for timing in system.timings}
-    largest_delays = [
-        max(timings[text] for text in (link.delay, *(pair.delay for pair in link.delays)))
-        for link in system.links
-    ]
+    largest_delays = [max(timings[text] for text in link.delays) for link in system.links]
     given_up = [[float(max(Fraction(GIVEN_UP), TIMES * delay))] for delay in largest_delays]
     links = tuple(map(traced, system.links, given_up))
     return replace(system, links=links, within=())
@@ -78,9 +75,14 @@ def live_topology(system: Model) -> Model:
 
 def traced(link: Link, delays: Sequence[float] | Floats) -> Link:
     """Return a link with recorded delays in seconds; its treatment of losses is unchanged."""
-    channel = link.channel or Channel(None, None, "uniform", "newest", "hold", None)
-    plain_channel = replace(channel, loss=None, jitter=None, distribution="uniform")
-    return replace(link, channel=replace(plain_channel, trace=np.asarray(delays)))
+    reliable, trace = Channel(None, None, "uniform", "newest", "hold", None), np.asarray(delays)
+
+    def recorded(channel: Channel) -> Channel:
+        """Return a channel with the recorded delays."""
+        return replace(channel, loss=None, jitter=None, distribution="uniform", trace=trace)
+
+    pairs = tuple(replace(pair, channel=pair.channel and recorded(pair.channel)) for pair in link.pairs)
+    return replace(link, channel=recorded(link.channel or reliable), pairs=pairs)
 
 
 class StoppedError(RuntimeError):
@@ -421,14 +423,10 @@ class _SinglePeer(InterpretedEngine):
             for route_index, arc in link.arcs[packet.sender]:
                 last = self.newest[route_index][arc]
                 self.newest[route_index][arc] = max(last, packet.count) if link.newest else packet.count
-        route, newest, arrival_process = (
-            self.routes[index],
-            self.newest[index],
-            self.loop.simulation.arrival_processes[index],
-        )
+        newest, arrival_process = self.newest[index], self.loop.simulation.arrival_processes[index]
         instant = int(self.instant // self.quantum_ns)
         due = (instant - arrival_process.nominal - arrival_process.phase) // arrival_process.period
-        missing = (newest < due) & (due >= 0) if route.zero else np.zeros(len(newest), np.bool_)
+        missing = (newest < due) & (due >= 0) & arrival_process.zero
         own_arcs = self.mine[index]
         self.observed[index].append((newest[own_arcs].copy(), missing[own_arcs].copy()))
         return newest.copy(), missing
@@ -557,10 +555,10 @@ class _EmulatedNetwork:
         loop, exchange = self.loop, self.loop.exchange
         arc, declared_link = (loop.local, receiver), loop.system.links[link.location]
         sender_group, receiver_group = map(exchange.group_of, arc)
-        delay = self.timings[exchange.delay(link.name, sender_group, receiver_group)]
+        delay = exchange.delay(link.name, sender_group, receiver_group)
         law = channel_law(
             loop.system,
-            declared_link if declared_link.channel else traced(declared_link, [float(delay)]),
+            declared_link if declared_link.channel else traced(declared_link, [float(self.timings[delay])]),
             delay,
         )
         return PacketSource(law, link.name, [arc], seed=loop.simulation.seed)

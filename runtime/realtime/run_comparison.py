@@ -257,7 +257,7 @@ def _measured_link(system: Model, link: Link, arcs: Sequence[ArcRun]) -> Measure
         replace(timing, value=delay) if timing.name == link.delay else timing for timing in system.timings
     )
     period = next(float(timing.value) for timing in timings if timing.name == clocks[link.clock])
-    measured_link = replace(traced(link, came.delays), delays=())
+    measured_link = replace(traced(link, came.delays), pairs=())
     links = tuple(measured_link if item is link else item for item in system.links)
     measured_system = replace(system, timings=timings, links=links)
     too_long = came.longest > LATEST * period or came.packets > LONGEST

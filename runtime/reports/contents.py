@@ -205,8 +205,9 @@ def _limits(system: Model, call: str) -> Section:
 def _network(system: Model, call: str) -> Section:
     """Return the section of the lossy network: mean-square stability, critical loss and jitter."""
     loss = choose(system, ())[LOSS]
-    channels = [link.channel for link in system.links if link.channel is not None]
-    jitters = [(JITTER, channel.jitter, "") for channel in channels if channel.jitter is not None]
+    channels = [channel for link in system.links for channel in link.channels]
+    names = dict.fromkeys(channel.jitter for channel in channels if channel.jitter is not None)
+    jitters = [(JITTER, name, "") for name in names]
     return _criticals(
         system,
         call,

@@ -173,7 +173,7 @@ def instants_within(schedules: Sequence[Schedule]) -> tuple[int, ...]:
 
 def refuse_unheard_of(system: Model) -> None:
     """Raise E893 if a link replaces lost packets by zero and a receiving peer has no own value to send."""
-    zero = {link.name for link in system.links if link.channel and link.channel.on_loss == "zero"}
+    zero = {link.name for link in system.links for channel in link.channels if channel.on_loss == "zero"}
     for peer_type in system.peer_types:
         for partition in peer_type.clocks:
             for receive in partition.receives:

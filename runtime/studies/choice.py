@@ -122,7 +122,7 @@ def _default_names(system: Model, axis: str) -> list[str]:
     if axis == DELAY:
         return _roots(system, [link.delay for link in links], ("s",))
     if axis == LOSS:
-        losses = [link.channel.loss for link in links if link.channel is not None]
+        losses = [channel.loss for link in links for channel in link.channels]
         return _roots(system, [loss.p for loss in losses if loss is not None], ("1",))
     receiving_parts = {
         channel.rpartition(".")[0]

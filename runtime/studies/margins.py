@@ -210,6 +210,7 @@ def _delays(system: Model) -> list[ParameterRef]:
 
     A link's own delay is left out if every pair of groups has a separate delay.
     """
+    independent = {timing.name for timing in named_times(system) if timing.formula is None}
     delay_names = [hold.delay for peer_type in system.peer_types for hold in peer_type.holds]
     directions = {
         (sender.name, receiver.name)
@@ -218,10 +219,8 @@ def _delays(system: Model) -> list[ParameterRef]:
         if sender is not receiver or sender.count > 1
     }
     for link in system.links:
-        if directions - {(pair.sender, pair.receiver) for pair in link.delays}:
-            delay_names.append(link.delay)
-        delay_names += [pair.delay for pair in link.delays]
-    independent = {timing.name for timing in named_times(system) if timing.formula is None}
+        separate = {(pair.sender, pair.receiver) for pair in link.pairs if pair.delay in independent}
+        delay_names += link.delays if directions - separate else link.delays[1:]
     return [ParameterRef(name) for name in dict.fromkeys(delay_names) if name in independent]
 
 
@@ -385,9 +384,10 @@ def _margin_points(system: Model, parameter_ref: ParameterRef, scale: float) -> 
     present, most = value_now(system, parameter_ref), allowed(system, parameter_ref)[1]
     if parameter_ref.name in channel_numbers(system):
         delays = [
-            value_now(system, ParameterRef(link.delay))
+            value_now(system, ParameterRef(delay))
             for link in system.links
-            if link.channel is not None and link.channel.jitter == parameter_ref.name
+            for delay in link.delays
+            if (channel := link.channel_at(delay)) and channel.jitter == parameter_ref.name
         ]
         points = np.linspace(present, min([most, *delays]), SHARES + 1)
         return points, float(points[1])

@@ -112,7 +112,7 @@ def _parameter(system: Model, parameter_ref: ParameterRef, location: SourceLocat
     name, group = parameter_ref.name, parameter_ref.group
     common = {parameter.name: parameter for parameter in system.parameters}
     times = {timing.name: timing.value for timing in system.timings}
-    delays = {text for link in system.links for text in (link.delay, *(pair.delay for pair in link.delays))}
+    delays = {text for link in system.links for text in link.delays}
     if name in delays:  # analysed segment by segment
         return Parameter(name, "s", float(times[name]), minimum=0.0, exact=times[name])
     if times_of(system, name) or name in scope_of(system).needed([*times]) or name not in common:

@@ -23,9 +23,7 @@ LOCATION = SourceLocation("box")
 
 def is_delay(system: Model, parameter_ref: ParameterRef) -> bool:
     """Return whether a timing is the delay of a link, or of some pairs of its peers."""
-    return any(
-        parameter_ref.name in (link.delay, *(pair.delay for pair in link.delays)) for link in system.links
-    )
+    return any(parameter_ref.name in link.delays for link in system.links)
 
 
 def representative_delays(system: Model, delay: Range) -> Iterator[tuple[Fraction, Fraction]]:

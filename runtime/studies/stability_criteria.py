@@ -108,7 +108,7 @@ def refuse_timing_parameter(
     ApcError
         E898 a timing parameter; E930 the same, or a channel parameter, with passive hands.
     """
-    jitter = {link.channel.jitter for link in system.links if link.channel is not None}
+    jitter = {channel.jitter for link in system.links for channel in link.channels}
     if reaches_time(system, parameter_ref) and parameter_ref.name not in jitter:
         message = (
             f"{parameter_ref.label} can't be varied {SCALAR_CRITERIA[criterion]}, "
@@ -360,7 +360,8 @@ def line_points(
     """
     if unit_of(system, parameter_ref.name) == "1" and parameter_ref.name in channel_numbers(system):
         # Endless bursts (r = 0) have no stationary distribution, and a loss of 1 delivers no packet.
-        endless = {link.channel.loss.r for link in system.links if link.channel and link.channel.loss}
+        channels = [channel for link in system.links for channel in link.channels]
+        endless = {channel.loss.r for channel in channels if channel.loss}
         least = 1 / SHARES if parameter_ref.name in endless else 0.0
         start, end = low if low is not None else least, high if high is not None else 1 - 1 / SHARES
         return np.linspace(start, end, SHARES), 1 / SHARES

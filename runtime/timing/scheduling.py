@@ -267,7 +267,7 @@ def _received_at_ticks(
             instant = times.clocks[clock].at(index - coupling_term.before)
             return (newest(coupling_term, channel, exchange.links[coupling_term.link], instant, times, rank),)
         row = UncertainSample(coupling_term, channel, clock, index)
-        law = exchange.links[coupling_term.link].channel
+        law = exchange.links[coupling_term.link].channel_at(coupling_term.delay)
         return (row, replace(row, gap=True)) if law is not None and law.on_loss == "zero" else (row,)
 
     for p in sorted({partition for partition, _ in live}):

@@ -152,7 +152,7 @@ class _Network:
         for name, link in self.links.items():
             if link.channel is None:
                 continue
-            law = channel_law(plan.system, link, timings[link.delay])
+            law = channel_law(plan.system, link, link.delay)
             for arc in itertools.permutations(range(plan.exchange.peers), 2):
                 used = PacketSource(law, name, [arc], seed=plan.system.experiment.seed).take(MOST_PACKETS)
                 self.late[(name, *arc)] = used[0].tolist()

@@ -32,11 +32,20 @@ OWN = replaced(
 BURSTS = replaced(
     MOVED, ("delay: 8 ms}", "delay: 8 ms, jitter: 4 ms, distribution: pareto, loss: {p: 10 %, r: 30 %}}")
 )
+ROOMS = replaced(
+    MIXED,
+    (
+        "delays: {near: {far: 40 ms}, far: {near: 40 ms}}",
+        "loss: 5 %, pairs: {near: {far: {delay: 40 ms, loss: {p: 20 %, r: 30 %}, jitter: 3 ms, "
+        "distribution: normal}}, far: {near: {delay: 30 ms, on_loss: zero, loss: 30 %}}}",
+    ),
+)
 TOPOLOGIES = {
     "moved": MOVED,
     "mixed clocks": MIXED,
     "a delay inside a tick": INSIDE,
     "pairs": PAIRS,
+    "pairs of groups": ROOMS,
     "late and lost, hold": LOSSY_HOLD,
     "bursts": BURSTS,
     "paper": PAPER,

@@ -192,4 +192,4 @@ def test_more_than_can_be_kept_is_refused_by_number(changes: list[tuple[str, str
 def test_the_law_of_a_link_is_no_groups() -> None:
     own = apc.set_parameters(compiled(unreliable("loss: 2 %")), {"user.lan.loss": "5 %"})
     with pytest.raises(ApcError, match=r"E891 lan\.loss belongs to a link and can't be set by group user"):
-        channel_law(own, own.links[0], Fraction(0))
+        channel_law(own, own.links[0], own.links[0].delay)

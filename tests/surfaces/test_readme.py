@@ -22,9 +22,9 @@ from apc.compiler.components.component import ROLES
 from apc.compiler.components.component_library import Library
 from apc.compiler.components.definitions import COMPONENT, CONNECTOR
 from apc.compiler.components.parts import PART_KEYS
+from apc.compiler.topology.channels import PROBABILITIES
 from apc.compiler.topology.graphs import PAIRS
 from apc.compiler.topology.groups import GROUP
-from apc.compiler.topology.links import PROBABILITIES
 from apc.compiler.topology.studies import AXES, EXPERIMENT, TUNED
 from apc.compiler.topology.timebase import CLOCK
 from apc.compiler.topology.topology import TOPOLOGY

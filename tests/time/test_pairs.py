@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError
 from apc.compiler.pipeline import compile_topology
-from apc.network.channel import PacketSource, channel_law
+from apc.network.channel import ChannelLaw, PacketSource, channel_law
 from apc.simulation.trajectory import simulate
 from tests.lossy import effective
 from tests.schemes import ByHand, Late, course
@@ -223,7 +224,7 @@ def test_each_pair_is_what_looking_at_every_packet_gives(
 def test_a_lost_packet_is_missed_by_its_pair_alone(tmp_path: Path, name: str, more: str, graph: str) -> None:
     _, force = FORCES[name]
     system = topology(tmp_path, name, f"delay: 8 ms, {more}" + (f", graph: {graph}" if graph else ""))
-    law = channel_law(system, system.links[0], 8 * MS)
+    law = channel_law(system, system.links[0], system.links[0].delay)
     arcs = GRAPHS[graph]
     late = {arc: PacketSource(law, "lan", [arc], seed=3).take(50)[0].tolist() for arc in arcs}
 
@@ -231,6 +232,37 @@ def test_a_lost_packet_is_missed_by_its_pair_alone(tmp_path: Path, name: str, mo
         return effective(late[i, j], tick, newest="all" not in more)
 
     expected = by_hand(force, arcs, packet, zero="zero" in more)
+    for jit in (False, True):
+        check(system, expected, seed=3, jit=jit)
+
+
+@pytest.mark.few(2)
+@pytest.mark.parametrize("name", FORCES)
+@pytest.mark.parametrize("graph", ["", [*GRAPHS][-1]])
+def test_each_pair_of_groups_loses_and_delays_by_its_own_law(tmp_path: Path, name: str, graph: str) -> None:
+    """What a pair does not say is the link's; of losses, only those from near to far are replaced by zero."""
+    _, force = FORCES[name]
+    pairs = "near: {far: {loss: 40 %, on_loss: zero}}"
+    pairs += ", far: {far: {loss: 0 %}, near: {delay: 19 ms, jitter: 6 ms}}"
+    graphed = f", graph: {graph}" if graph else ""
+    system = topology(tmp_path, name, f"delay: 8 ms, loss: 10 %, pairs: {{{pairs}}}{graphed}")
+    plain = ChannelLaw(0.1, 0.9, 1.0, 0.0, 0.008, 0.0, "uniform", None)
+    laws = {
+        (False, False): plain,
+        (False, True): replace(plain, p=0.4, r=0.6),
+        (True, True): replace(plain, p=0.0, r=1.0),
+        (True, False): replace(plain, delay=0.019, jitter=0.006),
+    }
+    late = {
+        arc: PacketSource(laws[arc[0] >= 2, arc[1] >= 2], "lan", [arc], seed=3).take(50)[0].tolist()
+        for arc in GRAPHS[graph]
+    }
+
+    def packet(i: int, j: int, tick: int) -> tuple[int, bool]:
+        number, missing = effective(late[i, j], tick, newest=True)
+        return number, missing and i < 2 <= j
+
+    expected = by_hand(force, GRAPHS[graph], packet, zero=True)
     for jit in (False, True):
         check(system, expected, seed=3, jit=jit)
 

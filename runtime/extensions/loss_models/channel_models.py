@@ -80,7 +80,7 @@ def channel_growth(
         return _trace_growth(numeric)
     if any(law.jitter for _, law in lossy):
         raise NotSupportedError("jitter together with bursty losses of another link, or on_loss: zero")
-    if all(link.channel is None or link.channel.on_loss == "hold" for link, law in lossy if law.mean_loss):
+    if not any(law.mean_loss and law.zero for _, law in lossy):
         return _burst_growth(numeric, None)
     first = _arrival_time(system, lossy)
     if all(is_memoryless(law) for _, law in lossy):
@@ -167,7 +167,7 @@ def _arrival_time(system: Model, lossy: Sequence[tuple[Link, ChannelLaw]]) -> Fr
     """
     timings = resolve(system).timings
     clocks = {clock.name: clock for clock in system.clocks}
-    if len(system.links) > 1 or system.links[0].delays:
+    if len(system.links) > 1 or system.links[0].pairs:
         raise NotSupportedError("substituted values together with packets of another link or delay")
     link = lossy[0][0]
     if link.after:

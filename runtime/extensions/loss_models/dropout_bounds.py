@@ -144,7 +144,7 @@ def worst_trace(system: Model) -> Model:
         )
     seconds = {timing.name: float(timing.value) for timing in system.timings}
     for link in system.links:
-        delays = {seconds[link.delay], *(seconds[delay.delay] for delay in link.delays)}
+        delays = {seconds[name] for name in link.delays}
         if link.channel is not None and len(delays) > 1:
             message = f"--trace-of worst requires one delay of {link.name}; it has several"
             raise ApcError(
@@ -156,7 +156,7 @@ def worst_trace(system: Model) -> Model:
         if link.channel is None:
             return link
         trace = np.where(pattern, np.inf, seconds[link.delay])
-        return replace(link, channel=replace(link.channel, loss=None, jitter=None, trace=trace))
+        return replace(link, channel=replace(link.channel, loss=None, jitter=None, trace=trace), pairs=())
 
     return replace(system, links=tuple(map(with_pattern, system.links)))
 
@@ -166,6 +166,10 @@ def _modes(numeric: NumericModel) -> tuple[list[LossMode], float]:
     system = numeric.model
     reception = build_reception(numeric)
     refuse_unheld(system, reception)
+    if mixed := [
+        link.name for link in system.links if len({channel.loss is None for channel in link.channels}) > 1
+    ]:
+        raise NotSupportedError(f"only some pairs of groups lose packets of {mixed[0]}")
     loops = orthogonal_loops(reception.groups, reception.exchange, GAIN_BOUND_STATES)
     lossy = frozenset(link.name for link in system.links if link.channel is not None)
     packets = Packets(system, reception)

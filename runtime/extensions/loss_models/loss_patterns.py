@@ -83,15 +83,16 @@ def refuse_unheld(system: Model, reception: PerTickReception) -> None:
     rows = [row for group_rows in reception.rows.values() for row in group_rows]
     clocks = {clock.name: clock for clock in system.clocks}
     for link in system.links:
-        if (channel := link.channel) is None:
+        for channel in link.channels:
+            if channel.trace is not None:
+                raise NotSupportedError(f"{link.name} has a trace")
+            if channel.jitter is not None:
+                raise NotSupportedError(f"{link.name} has jitter")
+            if channel.on_loss != "hold":
+                message = f"does not set the difference to 0 for a lost packet (on_loss: {channel.on_loss})"
+                raise NotSupportedError(f"{link.name} {message}")
+        if link.channel is None:
             continue
-        if channel.trace is not None:
-            raise NotSupportedError(f"{link.name} has a trace")
-        if channel.jitter is not None:
-            raise NotSupportedError(f"{link.name} has jitter")
-        if channel.on_loss != "hold":
-            message = f"does not set the difference to 0 for a lost packet (on_loss: {channel.on_loss})"
-            raise NotSupportedError(f"{link.name} {message}")
         if reception.timings[clocks[link.clock].period] < reception.frame:
             message = f"more than one packet in a frame of {float(reception.frame):g} s"
             raise NotSupportedError(f"{link.name} sends {message}")
@@ -132,7 +133,7 @@ def hold_frame(system: Model, reception: PerTickReception, *, interchangeable: b
             if any(weights.values()):
                 received_channels.append(ReceivedChannel(g, memory.route, weights))
                 loss_channels.append((g, h, number))
-                laws.append(channel_law(system, links[memory.route[0]], reception.timings[memory.route[1]]))
+                laws.append(channel_law(system, links[memory.route[0]], memory.route[1]))
     no_neutral_modes = np.zeros((sum(len(subsystem.z_names) for subsystem in loop.subsystems), 0))
     means = mean_loop(loop, reception.of(loop), memories, received_channels, no_neutral_modes)
     matrix, first = value_of(means.matrix), means.offsets[-1]

@@ -173,7 +173,7 @@ def receivers_of(
         raise NotSupportedError("substituted values together with packets of other links")
     (memory,) = stored
     link = next(link for link in system.links if link.name == memory.route[0])
-    law = channel_law(system, link, reception.timings[memory.route[1]])
+    law = channel_law(system, link, memory.route[1])
     counts = [subsystem.count for subsystem in common.subsystems]
     subsystems = [with_memory(group, stored) for group in common.subsystems]
     received_now = sorted(set(memory.memory.received.values()))

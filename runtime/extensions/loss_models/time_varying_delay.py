@@ -36,6 +36,7 @@ from apc.lifting.numeric_model import NumericModel, numeric_model
 from apc.mean_square.class_moments import build_reception
 from apc.parameter_values.overrides import Override, apply
 from apc.parameter_values.parameter_names import ParameterRef
+from apc.parameter_values.parameters import scope_of
 from apc.spectrum.modes import orthogonal_loops
 from apc.support.not_supported import NotSupportedError
 from apc.support.state_limits import GAIN_BOUND_STATES
@@ -78,9 +79,9 @@ def _loop_gain(numeric: NumericModel, delay: ParameterRef, low: Fraction, high: 
     """Return `loop_gain` on one side of a kink."""
     system = numeric.model
     middle = apply(system, [Override(delay, (low + high) / 2)])
-    (link,) = (
-        link for link in system.links if delay.name in (link.delay, *(pair.delay for pair in link.delays))
-    )
+    (link,) = (link for link in system.links if delay.name in link.delays)
+    if [name for name in link.delays if delay.name in scope_of(system).needed([name])] != [delay.name]:
+        raise NotSupportedError(f"the delays of several pairs of groups depend on {delay.label}")
     if any(
         receive.age or receive.before
         for peer_type in system.peer_types
@@ -145,7 +146,8 @@ def unstable_delays(
         trace = np.array([float(low)] * first + [float(high)] * second)
         channel = replace(HOLDING, trace=trace)
         links = tuple(
-            replace(link, channel=channel) if link.delay == delay.name else link for link in system.links
+            replace(link, channel=channel) if link.delay == delay.name and not link.pairs else link
+            for link in system.links
         )
         recorded = replace(system, links=links)
         if links != system.links and trace_radius(numeric_model(recorded)).low > 1:

@@ -49,7 +49,7 @@ from apc.mean_square.class_moments import (
     peer_classes,
     stored_of,
 )
-from apc.mean_square.mean_dynamics import RouteMemory
+from apc.mean_square.mean_dynamics import Route, RouteMemory
 from apc.mean_square.mean_square_stability import MeanSquareVerdict, mean_square_growth
 from apc.mean_square.receiver_memory import is_memoryless
 from apc.mean_square.second_moment_operator import proves_decay
@@ -57,7 +57,6 @@ from apc.network.channel import channel_law
 from apc.network.nominal_criterion import channel_numbers, unreliable
 from apc.parameter_values.overrides import Override, apply
 from apc.parameter_values.parameter_names import Range
-from apc.parameter_values.parameters import resolve
 from apc.spectrum.interconnection import ModalSystem, without_packets
 from apc.spectrum.rigid_modes import stays_rigid
 from apc.support.threads import single_threaded
@@ -179,15 +178,14 @@ def _refuse_range(numeric: NumericModel, interval: Range) -> None:
     """Raise ApcError E898 for a network or a range for which no box is proved."""
     system = numeric.model
     message = ""
-    for link, law in unreliable(system):
-        assert link.channel is not None
+    for _, law in unreliable(system):
         if law.trace is not None:
-            message = f"recorded delays of {link.name}"
+            message = f"recorded delays of {law.label}"
         elif not is_memoryless(law):
-            message = f"bursts of {link.name}"
-        elif law.mean_loss and link.channel.on_loss == "zero":
-            message = f"losses of {link.name} with on_loss: zero"
-    losses = [link.channel.loss for link in system.links if link.channel and link.channel.loss]
+            message = f"bursts of {law.label}"
+        elif law.mean_loss and law.zero:
+            message = f"losses of {law.label} with on_loss: zero"
+    losses = [channel.loss for link in system.links for channel in link.channels if channel.loss]
     shares = {name for loss in losses for name in (loss.p, loss.r, loss.one_minus_h, loss.one_minus_k)}
     if interval.free.name in channel_numbers(system) - shares:
         message = f"{interval.free.label}, which determines other parameters of a link"
@@ -259,8 +257,8 @@ def _memories(problem: _BoxProblem, cell: Cell) -> Sequence[RouteMemory]:
     return stored_of(system, problem.classes.reception, problem.wide, lost=changes)
 
 
-def _loss_changes(problem: _BoxProblem, cell: Cell, shares: Sequence[int]) -> dict[str, tuple[float, ...]]:
-    """Return, for each link, the bound of the nonlinear part of its loss probability, and its changes over
+def _loss_changes(problem: _BoxProblem, cell: Cell, shares: Sequence[int]) -> dict[Route, tuple[float, ...]]:
+    """Return, for each route, the bound of the nonlinear part of its loss probability, and its changes over
     a cell.
 
     The loss probability is multilinear in the parameters, and so is its nonlinear part, which is largest at a
@@ -268,12 +266,12 @@ def _loss_changes(problem: _BoxProblem, cell: Cell, shares: Sequence[int]) -> di
     """
     inner = middle(cell)
 
-    def lost(point: Sequence[Fraction]) -> dict[str, float]:
-        """Return the mean loss probability of each link at a point."""
+    def lost(point: Sequence[Fraction]) -> dict[Route, float]:
+        """Return the mean loss probability of each route at a point."""
         changed = _model_at_point(problem.numeric.model, problem.ranges, point, shares)
-        timings = resolve(changed).timings
         links = [link for link in changed.links if link.channel is not None]
-        return {link.name: channel_law(changed, link, timings[link.delay]).mean_loss for link in links}
+        routes = [(link, delay) for link in links for delay in link.delays]
+        return {(link.name, delay): channel_law(changed, link, delay).mean_loss for link, delay in routes}
 
     at_centre, sides = lost(inner), []
     for index in shares:

@@ -211,9 +211,9 @@ def fit(
     if recording.is_dir():
         recorded = signals_of_run(system, read_run(recording), signals)
     else:
-        for link, law in unreliable(system):
+        for _, law in unreliable(system):
             if law.trace is None:
-                message = f"{chance(link, law)}: a table does not contain the packets that arrived"
+                message = f"{chance(law)}: a table does not contain the packets that arrived"
                 location, fix = SourceLocation(system.origin.topology), f"apc run {system.origin.topology}"
                 raise ApcError(Diagnostic("E713", location, message, fix=fix))
         recorded = recorded_signals(system, read_recording(recording), signals)

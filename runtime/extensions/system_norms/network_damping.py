@@ -58,7 +58,7 @@ def network_damping(
         system,
         timings=(*system.timings, Timing(AT_ONCE, Fraction(0))),
         links=tuple(
-            replace(link, clock=next(iter(receiving[link.name])), delay=AT_ONCE, delays=(), channel=None)
+            replace(link, clock=next(iter(receiving[link.name])), delay=AT_ONCE, pairs=(), channel=None)
             for link in system.links
         ),
     )

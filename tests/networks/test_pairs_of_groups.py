@@ -1,0 +1,152 @@
+"""Pairs of groups with a channel of their own, against two links and moments of all patterns of loss."""
+
+from __future__ import annotations
+
+import itertools
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import apc
+from apc.compiler.compiled import Model
+from apc.compiler.errors import ApcError
+from apc.exports.modelica import modelica
+from tests.bruteforce import PacketOutcomes, TopologySource, lossy_frame, states_read
+from tests.topologies import compiled, replaced
+from tests.truths import text_of
+
+MS = Fraction(1, 1000)
+
+# Two rooms: pulls within a room come late by 2 ms, those between rooms by 30 ms, and these may get lost.
+ROOMS = """\
+topology: rooms
+clocks: {haptic: 1 ms, network: 8 ms}
+peers: {lab: {count: 2}, far: {count: 2}}
+masses:
+  device: {mass: 0.1 kg, damping: 5 N*s/m}
+  cube:   {mass: 0.6 kg, damping: 5 N*s/m, shared: true}
+couplers:
+  contact: {type: SampledSpringDamper, a: device, b: cube, stiffness: 1000 N/m, clock: haptic, delay: 1 ms}
+  mesh: {type: FullMesh, object: cube, stiffness: 250 N/m, clock: haptic, delay: 1 ms, link: lan}
+links:
+  lan: {clock: network, delay: 2 ms}
+"""
+WAN = "delay: 30 ms, loss: 2 %"
+PAIRS = replaced(
+    ROOMS, ("delay: 2 ms}", f"delay: 2 ms, pairs: {{lab: {{far: {{{WAN}}}}}, far: {{lab: {{{WAN}}}}}}}}}")
+)
+BETWEEN = "[[1, 3], [1, 4], [2, 3], [2, 4], [3, 1], [3, 2], [4, 1], [4, 2]]"
+TWO_LINKS = replaced(
+    ROOMS,
+    (
+        "  mesh: {type: FullMesh, object: cube, stiffness: 250 N/m, clock: haptic, delay: 1 ms, link: lan}\n",
+        "".join(
+            f"  mesh_{link}: {{type: FullMesh, object: cube, stiffness: 250 N/m, clock: haptic, delay: 1 ms, "
+            f"link: {link}}}\n"
+            for link in ("lan", "wan")
+        ),
+    ),
+    (
+        "delay: 2 ms}",
+        "delay: 2 ms, graph: {arcs: [[1, 2], [2, 1], [3, 4], [4, 3]]}}\n"
+        f"  wan: {{clock: network, {WAN}, graph: {{arcs: {BETWEEN}}}}}",
+    ),
+)
+
+
+def poles(system: Model) -> NDArray[np.complex128]:
+    """Return the eigenvalues of the nominal network that are not 0, sorted."""
+    values = np.array([one.eigenvalue for one in apc.analyze(system).modes])
+    return np.sort_complex(values[np.abs(values) > 1e-6])
+
+
+def growth(system: Model) -> float:
+    found = apc.mean_square_stability(system)
+    assert found is not None and found.exact and found.mean_square_radius is not None, found
+    return found.mean_square_radius
+
+
+def test_a_pair_replaces_a_second_link_with_arcs() -> None:
+    one, two = compiled(PAIRS), compiled(TWO_LINKS)
+    assert growth(one) == pytest.approx(growth(two), rel=1e-10)
+    assert apc.analyze(one).spectral_radius == pytest.approx(apc.analyze(two).spectral_radius, rel=1e-13)
+    np.testing.assert_allclose(poles(one), poles(two), rtol=0, atol=1e-10)
+
+
+def moments(losses: tuple[float, float], late: tuple[int, int]) -> float:
+    """Return the growth of second moments of two users by Kronecker products over all patterns of loss.
+
+    `losses` and `late` (in ms) are those from the first to the second user, and back.
+    """
+    arcs = [(0, 1), (1, 0)]
+    topology = TopologySource(peers=2, late={arc: ms * MS for arc, ms in zip(arcs, late, strict=True)})
+    patterns = [*itertools.product((True, False), repeat=2)]
+    outcomes = [PacketOutcomes({arcs[0]: there[:1], arcs[1]: there[1:]}) for there in patterns]
+    maps = np.array([lossy_frame(topology, outcome)[0] for outcome in outcomes])
+    read = states_read(maps)
+    maps = maps[:, read][:, :, read]
+    still = np.linalg.svd((maps - np.eye(len(read))).reshape(-1, len(read)))
+    rest = still[2][: int((still[1] > 1e-9).sum())]  # what some map moves
+    chances = [
+        np.prod([1 - loss if here else loss for loss, here in zip(losses, there, strict=True)])
+        for there in patterns
+    ]
+    moved = rest @ maps @ rest.T
+    operator = sum(chance * np.kron(one, one) for chance, one in zip(chances, moved, strict=True))
+    return float(np.abs(np.linalg.eigvals(operator)).max())
+
+
+@pytest.mark.parametrize(
+    ("losses", "late"), [((0.3, 0.0), (8, 8)), ((0.3, 0.05), (8, 16)), ((0.0, 0.6), (16, 8))]
+)
+def test_second_moments_are_those_of_all_patterns_of_loss(
+    losses: tuple[float, float], late: tuple[int, int]
+) -> None:
+    text = text_of(TopologySource(peers=2, users=({}, {})))
+    (one, other), (there, back) = losses, late
+    pairs = f"u1: {{u2: {{delay: {there} ms, loss: {one}}}}}, u2: {{u1: {{delay: {back} ms, loss: {other}}}}}"
+    system = compiled(replaced(text, ("delay: 8 ms}", f"delay: 8 ms, pairs: {{{pairs}}}}}")))
+    assert growth(system) == pytest.approx(moments(losses, late), rel=1e-8)
+
+
+def test_a_pair_is_set_without_compiling() -> None:
+    written = compiled(replaced(PAIRS, ("far: {delay: 30 ms, loss: 2 %}", "far: {delay: 22 ms, loss: 30 %}")))
+    named = {"lan.pairs.lab.far.loss": "30 %", "lan.pairs.lab.far.delay": "22 ms"}
+    assert growth(apc.set_parameters(compiled(PAIRS), named)) == growth(written)
+
+
+def test_a_pair_without_delay_follows_the_link() -> None:
+    both = replaced(PAIRS, ("lab: {far: {delay: 30 ms, loss: 2 %}}", "lab: {far: {loss: 2 %}}"))
+    later = apc.set_parameters(compiled(both), {"lan.delay": "12 ms"})
+    written = replaced(
+        PAIRS, ("lab: {far: {delay: 30 ms", "lab: {far: {delay: 12 ms"), ("delay: 2 ms, p", "delay: 12 ms, p")
+    )
+    assert growth(later) == growth(compiled(written))
+
+
+def test_delays_are_pairs_with_a_delay_only() -> None:
+    by_delays, by_pairs = (
+        compiled(replaced(ROOMS, ("delay: 2 ms}", f"delay: 2 ms, {text}}}")))
+        for text in ("delays: {lab: {far: 30 ms}}", "pairs: {lab: {far: {delay: 30 ms}}}")
+    )
+    assert apc.analyze(by_delays).spectral_radius == apc.analyze(by_pairs).spectral_radius
+
+
+def test_consecutive_losses_of_some_pairs_are_not_judged() -> None:
+    found = apc.mean_square_stability(compiled(PAIRS))
+    assert found is not None and found.losses_in_a_row is not None
+    assert "only some pairs of groups lose packets of lan" in found.losses_in_a_row.note
+
+
+def test_the_limitations_name_the_pair() -> None:
+    (first, second) = apc.analyze(compiled(PAIRS)).limitations
+    nominal = "every packet has the nominal delay of 30 ms"
+    assert first == f"excluded: packet loss (2 %) of lan from lab to far; {nominal}"
+    assert "lan from far to lab" in second
+
+
+def test_modelica_refuses_a_lossy_pair_by_name() -> None:
+    with pytest.raises(ApcError, match=r"E955 .*packet loss \(2 %\) of lan from lab to far"):
+        modelica(compiled(PAIRS))
