@@ -34,6 +34,7 @@ LENGTH, ANGLES = "m", ("rad", "1")
 PEERS = "peers"  # the parameter for the number of all peers
 LARGEST_COUNT = 10**9  # of peers in one group
 MOST_GROUPS = 1000  # groups of a model: the communication between groups has an entry per pair
+MOST_GROUP_ARCS = 2 * 10**6  # arcs of a graph by groups
 MOST_PLACED = 10**6  # peers of a model on a graph that isn't complete: several arrays have an entry per peer
 REST = "rest("  # prefix of the parameters that replace start values by those of an equilibrium, see `rest_of`
 COUNT = "count("  # prefix of the parameters that count received peers of a link, see `count_of`
@@ -64,6 +65,10 @@ def counts_peers(parameter: str) -> bool:
     return parameter == PEERS or parameter.startswith(COUNT) or parameter.endswith(".count")
 
 
+# Arcs from each peer of a group to each other peer of a group, with their weight.
+GroupArc = tuple[str, str, float]
+
+
 @dataclass(frozen=True, slots=True)
 class Clock:
     """A clock with ticks at `phase + k*period`, k = 0, 1, …; `period` and `phase` are names of timings.
@@ -84,12 +89,14 @@ class Graph:
 
     `arcs` (M, 2) are then (sender, receiver) pairs, peers counted from 0 over the groups in order, and
     `weights` (M,) the factors of the sender's packets, each representing its shortest decimal (see
-    `weights`); for the other shapes both are empty.
+    `weights`); for the other shapes both are empty. `groups` are the sender, receiver and weight of arcs
+    between groups, if all arcs are given by groups: `arcs` then follow the counts.
     """
 
     shape: str
     arcs: NDArray[np.int64]
     weights: NDArray[np.float64]
+    groups: tuple[GroupArc, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,7 +1,8 @@
 """Numbers of peers and of senders to each peer, computed from the counts of groups.
 
-Takes: groups, peer types and links of a compiled model.
-Gives: `with_received`, `received_sums`; `recounted`, `least_peers`, `peers_of`.
+Takes: groups, peer types, links and counts of a compiled model.
+Gives: `with_received`, `received_sums`, `refuse_equal_sums`; `graph_of_groups`; `recounted`, `least_peers`,
+`peers_of`.
 Guarantees: a model with changed counts equals the compiled topology with these counts.
 Does not: change the count of a group with different peers, or of peers named by a graph: E626.
 """
@@ -19,9 +20,12 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import (
     LARGEST_COUNT,
+    MOST_GROUP_ARCS,
     MOST_PLACED,
     PEERS,
+    Graph,
     Group,
+    GroupArc,
     Link,
     Model,
     Parameter,
@@ -32,7 +36,7 @@ from apc.compiler.compiled import (
 )
 from apc.compiler.errors import Mistakes, SourceLocation
 from apc.compiler.source.reading import fault
-from apc.compiler.weights import sum_weights
+from apc.compiler.weights import arcs_of_groups, sum_weights
 
 COUNT_ABOUT = "peers received over the link, counted with their weights"
 
@@ -71,6 +75,46 @@ def with_received(
 def received_sums(link: Link, peers: int) -> NDArray[Any]:
     """Return the exact sum of the weights of each peer's incoming arcs over a link with arcs (N,)."""
     return sum_weights(link.graph.arcs[:, 1], link.graph.weights, peers)
+
+
+def refuse_equal_sums(
+    peer_types: Sequence[PeerType], links: Sequence[Link], peers: int, locations: Mapping[str, SourceLocation]
+) -> None:
+    """Raise E217 if different sums of weights that peers receive over a link are equal in floats.
+
+    Parameters
+    ----------
+    peer_types, links, peers
+        The peer types, the links and the number of peers of the model.
+    locations
+        The location of each link, or of the setting of a count.
+    """
+    used = {name for peer_type in peer_types for name in peer_type.parameters}
+    for link in links:
+        if count_of(link.name) in used and link.graph.shape == "arcs":
+            values = set(received_sums(link, peers).tolist())
+            if len(set(map(float, values))) < len(values):
+                message = f"two sums of weights over {link.name} differ by less than rounding"
+                raise fault("E217", locations[link.name], message, advice="use weights of at most 15 digits")
+
+
+def graph_of_groups(
+    entries: Sequence[GroupArc], counts: Mapping[str, int], location: SourceLocation, code: str
+) -> Graph:
+    """Return the graph of arcs between groups.
+
+    Parameters
+    ----------
+    entries, counts
+        As for `arcs_of_groups`.
+    location, code
+        The location of the graph or of the setting of a count, and the code of the error for too many arcs.
+    """
+    total = sum(counts[sender] * counts[receiver] for sender, receiver, _ in entries)
+    if total > MOST_GROUP_ARCS:
+        expected = f"at most {MOST_GROUP_ARCS:,} arcs"
+        raise fault(code, location, "graph", expected, f"{total:,}", advice="use graph: complete")
+    return Graph("arcs", *arcs_of_groups(entries, counts), tuple(entries))
 
 
 def _received(
@@ -117,7 +161,7 @@ def recounted(system: Model, counts: Mapping[str, Fraction], location: SourceLoc
     mistakes = Mistakes()
     total = sum(counts.values())
     others = {count_of(link.name): total - 1 for link in system.links}
-    arcs = [link.name for link in system.links if link.graph.shape == "arcs"]
+    arcs = [link.name for link in system.links if link.graph.shape == "arcs" and not link.graph.groups]
     shaped = [link.name for link in system.links if link.graph.shape != "complete"]
     groups = [replace(group, count=int(counts[group.name])) for group in system.groups]
     for group in system.groups:
@@ -134,7 +178,8 @@ def recounted(system: Model, counts: Mapping[str, Fraction], location: SourceLoc
                 raise fault("E626", location, f"{message}; the count can't be changed")
             if arcs:
                 message = f"the graph of {arcs[0]} lists peers by number; {name} can't be changed"
-                raise fault("E626", location, message)
+                advice = f"name the groups in the graph, as in [{group.name}, {group.name}]"
+                raise fault("E626", location, message, advice=advice)
             if shaped and total > MOST_PLACED:
                 expected = f"at most {MOST_PLACED:,} peers where {shaped[0]} isn't complete"
                 raise fault("E626", location, name, expected, f"{int(total):,}")
@@ -142,9 +187,19 @@ def recounted(system: Model, counts: Mapping[str, Fraction], location: SourceLoc
         message, expected = "total number of peers", "at least 2, as a part receives from the other peers"
         raise fault("E626", location, message, expected, f"{int(total)}")
     mistakes.raise_if_any()
+    group_counts = {group.name: group.count for group in groups}
+    links = tuple(
+        replace(link, graph=graph_of_groups(link.graph.groups, group_counts, location, "E626"))
+        if link.graph.groups
+        else link
+        for link in system.links
+    )
+    locations = dict.fromkeys((link.name for link in links), location)
+    refuse_equal_sums(system.peer_types, links, int(total), locations)
     return replace(
         system,
-        groups=with_received(groups, system.peer_types, system.links),
+        links=links,
+        groups=with_received(groups, system.peer_types, links),
         parameters=tuple(
             replace(parameter, value=float(others[parameter.name])) if parameter.name in others else parameter
             for parameter in system.parameters

@@ -1,7 +1,7 @@
 """Arcs of a graph and exact weights: the decimals of the file, and each peer's sum of weights.
 
 Takes: a `Graph`; weights as floats, each representing its shortest decimal.
-Gives: `arcs` of a graph; `exact_weight`, `sum_weights`.
+Gives: `arcs` of a graph, `arcs_of_groups`; `exact_weight`, `sum_weights`.
 Guarantees: sums are exact, so that 0.1 and 0.2 are 0.3, and 0.1, 0.2 and −0.3 are zero.
 Does not: read graphs (see `topology.graphs`).
 
@@ -12,14 +12,16 @@ sum as its own weight would act as a spring to ground.
 from __future__ import annotations
 
 import functools
+import itertools
 import math
+from collections.abc import Mapping, Sequence
 from fractions import Fraction
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.compiled import Graph
+from apc.compiler.compiled import Graph, GroupArc
 
 
 def arcs(graph: Graph, peers: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
@@ -39,6 +41,29 @@ def arcs(graph: Graph, peers: int) -> tuple[NDArray[np.int64], NDArray[np.float6
         one_direction = np.stack(np.triu_indices(peers, 1), axis=1)
     pairs = np.concatenate([one_direction, one_direction[:, ::-1]]).astype(np.int64)
     return pairs, np.ones(len(pairs))
+
+
+def arcs_of_groups(
+    entries: Sequence[GroupArc], counts: Mapping[str, int]
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return the (sender, receiver) pairs (M, 2) between groups, and their weights (M,).
+
+    Parameters
+    ----------
+    entries
+        The sender, receiver and weight of the arcs between groups. A group is connected to itself between its
+        different peers.
+    counts
+        The number of peers of each group, in order.
+    """
+    starts = dict(zip(counts, itertools.accumulate(counts.values(), initial=0), strict=False))
+    pairs, weights = [np.zeros((0, 2), np.int64)], [np.zeros(0)]
+    for sender, receiver, weight in entries:
+        ends = [np.arange(starts[name], starts[name] + counts[name]) for name in (sender, receiver)]
+        block = np.stack(np.meshgrid(*ends, indexing="ij"), axis=-1).reshape(-1, 2)
+        pairs.append(block[block[:, 0] != block[:, 1]])
+        weights.append(np.full(len(pairs[-1]), weight))
+    return np.concatenate(pairs), np.concatenate(weights)
 
 
 def exact_weight(weight: float) -> Fraction:

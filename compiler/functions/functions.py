@@ -45,7 +45,6 @@ from apc.compiler.functions.topology_data import (
     check_links,
     compiled_groups,
     followers_of,
-    refuse_equal_sums,
     used_clocks,
     used_links,
 )
@@ -53,6 +52,7 @@ from apc.compiler.language.dimensions import Dimension
 from apc.compiler.language.expression import format_expression, names
 from apc.compiler.language.unit_text import format_dimension
 from apc.compiler.language.vectors import whole_and_index
+from apc.compiler.peer_counts import refuse_equal_sums
 from apc.compiler.topology.instances import PartInstance
 from apc.compiler.topology.topology_warnings import warning_texts
 
@@ -113,10 +113,11 @@ def build_functions(system: SortedSystem, origin: Origin, *, linear: SortedSyste
         (link.name, "its packets are not received") for link in topology.links if link.name not in used
     ]
     dropped += [(clock.name, "it is not used") for clock in topology.clocks if clock.name not in used]
-    for peer_type in peer_types:
-        refuse_equal_sums(topology, peer_type, links)
     parameters = all_parameters(topology, peer_types, links)
     groups = compiled_groups(topology, peer_types, locations, links, timings)
+    refuse_equal_sums(
+        peer_types, links, topology.peers, {link.name: link.location for link in topology.links}
+    )
     return Model(
         topology.name,
         topology.description,

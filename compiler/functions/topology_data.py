@@ -1,7 +1,7 @@
 """Parameters, groups and communication graphs of a compiled model: all except its functions.
 
 Takes: `Topology`, and the peer types with their functions. Gives: `Timings`; `used_links`, `check_links`,
-`used_clocks`; `compiled_groups`, `refuse_equal_sums`; `all_parameters`, `followers_of`.
+`used_clocks`; `compiled_groups`; `all_parameters`, `followers_of`.
 Guarantees: periods, phases and delays are exact; dependent values have their formulas.
 Does not: build functions.
 """
@@ -42,7 +42,7 @@ from apc.compiler.language.evaluation import evaluate, formula_of
 from apc.compiler.language.expression import Expr, Name, format_expression
 from apc.compiler.language.unit_text import format_dimension
 from apc.compiler.language.values import ScalarValue, renamed
-from apc.compiler.peer_counts import COUNT_ABOUT, received_sums, with_received
+from apc.compiler.peer_counts import COUNT_ABOUT, with_received
 from apc.compiler.topology.channels import PROBABILITIES, ChannelDeclaration
 from apc.compiler.topology.groups import GroupDeclaration
 from apc.compiler.topology.topology import Topology
@@ -240,7 +240,9 @@ def check_links(topology: Topology, peer_types: Sequence[PeerType], indices: Seq
         message = f"{receive}, so {used[first[0][0]]}() is undefined"
         advice = f"add an arc to {'each of them' if len(deaf) > 1 else names[0]}"
         receiving = np.bincount(owner[deaf], minlength=len(groups)) < counts
-        if not receiving.all() and receiving.any():
+        if np.isin(deaf, senders).any():
+            advice += ", or use a coupler with sum(), such as FullMesh, at peers that only send"
+        elif not receiving.all() and receiving.any():
             others = [group.name for group, receives in zip(groups, receiving, strict=True) if receives]
             advice += f", or use at: [{', '.join(others)}] in the couplers of {link.name}"
         mistakes.add("E801", link.location, message, advice=advice)
@@ -305,18 +307,6 @@ def compiled_groups(
             )
             raise ApcError(Diagnostic("E215", link.location, message))
     return with_received(groups, peer_types, links)
-
-
-def refuse_equal_sums(topology: Topology, peer_type: PeerType, links: Sequence[Link]) -> None:
-    """Raise E217 if different sums of weights received by peers of a type are equal in floats."""
-    locations = {link.name: link.location for link in topology.links}
-    for link in links:
-        if count_of(link.name) in peer_type.parameters and link.graph.shape == "arcs":
-            values = set(received_sums(link, topology.peers).tolist())
-            if len(set(map(float, values))) < len(values):
-                message = f"two sums of weights over {link.name} differ by less than rounding"
-                advice = "use weights of at most 15 digits"
-                raise ApcError(Diagnostic("E217", locations[link.name], message, advice=advice))
 
 
 # ---- numbers by name ----

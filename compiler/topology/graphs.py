@@ -9,7 +9,7 @@ Does not: build a matrix: a complete graph, a ring and a star are stored by name
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 from functools import partial
 
@@ -21,6 +21,7 @@ from apc.compiler.files import InputFile
 from apc.compiler.language.csv_tables import open_table
 from apc.compiler.language.values import AlreadyReportedError
 from apc.compiler.number_parsing import plain_float
+from apc.compiler.peer_counts import graph_of_groups
 from apc.compiler.source import nodes
 from apc.compiler.source.nodes import Node, Scalar, Sequence
 from apc.compiler.source.reading import MappingReader, among, brief, fault, form, mapping_of, unknown
@@ -72,7 +73,8 @@ def read_graph(node: Node, numbers: NamedNumbers) -> Graph:
         raise fault("E203", node.location, "graph", "edges or arcs", got, shown)
     [key] = given
     pairs = body.nodes[key]
-    numbered = _peer_indices(numbers.counts)
+    counts = numbers.counts
+    numbered = _peer_indices(counts)
     if isinstance(pairs, Scalar) and pairs.text.endswith(".csv"):
         if "peers" in numbers.faulty:
             raise AlreadyReportedError
@@ -86,22 +88,37 @@ def read_graph(node: Node, numbers: NamedNumbers) -> Graph:
         )
     if "peers" in numbers.faulty:
         raise AlreadyReportedError
-    result: dict[tuple[int, int], float] = {}
+    result: dict[tuple[int | str, int | str], float] = {}
     for pair in items:
         with mistakes:
-            sender, receiver, weight = _arc(pair, key, numbered, mistakes)
+            sender, receiver, weight = _arc(pair, key, numbered, counts, mistakes)
             if (sender, receiver) in result or (key == "edges" and (receiver, sender) in result):
-                message = f"the arc from peer {sender + 1} to peer {receiver + 1} is given twice"
-                if key == "edges":
-                    first, second = sorted((sender + 1, receiver + 1))
-                    message = f"the edge between peers {first} and {second} is given twice"
-                advice = "it has both directions; arcs have one"
                 reverse = (sender, receiver) not in result
+                message = f"the arc from {_named(sender)} to {_named(receiver)} is given twice"
+                if key == "edges":
+                    first, second = (receiver, sender) if reverse else (sender, receiver)
+                    message = f"the edge between {_named(first)} and {_named(second)} is given twice"
+                advice = "it has both directions; arcs have one"
                 raise fault("E213", pair.location, message, advice=advice if reverse else "")
             result[sender, receiver] = weight
     if key == "edges":
         result |= {(receiver, sender): weight for (sender, receiver), weight in result.items()}
+    by_group = [
+        (sender, receiver, weight)
+        for (sender, receiver), weight in result.items()
+        if isinstance(sender, str) and isinstance(receiver, str)
+    ]
+    if by_group and len(by_group) == len(result):
+        return graph_of_groups(by_group, counts, pairs.location, "E208")
+    if any(isinstance(end, str) for ends in result for end in ends):
+        advice = "define a group of one peer, and name groups only"
+        raise fault("E213", pairs.location, key, "pairs of groups or pairs of peers", "both", advice=advice)
     return Graph("arcs", np.array([*result], np.int64).reshape(-1, 2), np.array([*result.values()]))
+
+
+def _named(end: int | str) -> str:
+    """Return the name of an end of an arc: a peer by its number from 1, or a group."""
+    return end if isinstance(end, str) else f"peer {end + 1}"
 
 
 def _read_pairs(file: InputFile, named_at: SourceLocation, numbered: Mapping[str, int]) -> tuple[Node, ...]:
@@ -146,7 +163,10 @@ def may_have_self_arcs(node: Node | None) -> bool:
         return arcs is not None
     pairs = (pair.items[:2] for pair in arcs.items if isinstance(pair, Sequence) and len(pair.items) >= 2)
     return any(
-        isinstance(first, Scalar) and isinstance(second, Scalar) and first.text == second.text
+        isinstance(first, Scalar)
+        and isinstance(second, Scalar)
+        and first.text == second.text
+        and not first.text.isidentifier()  # a group is connected to itself between different peers
         for first, second in pairs
     )
 
@@ -159,15 +179,19 @@ def _peer_indices(counts: Mapping[str, int]) -> dict[str, int]:
     return {name: k for k, name in enumerate(names)} | {str(k + 1): k for k in range(len(names))}
 
 
-def _arc(pair: Node, subject: str, index_of: Mapping[str, int], mistakes: Mistakes) -> tuple[int, int, float]:
-    """Return an arc of a list of pairs: the zero-based indices of sender and receiver, and the weight.
+def _arc(
+    pair: Node, subject: str, index_of: Mapping[str, int], groups: Collection[str], mistakes: Mistakes
+) -> tuple[int | str, int | str, float]:
+    """Return an arc of a list of pairs: sender, receiver and weight.
+
+    A peer is returned as its zero-based index, a group as its name.
 
     Parameters
     ----------
     pair, subject
         The YAML node `[from, to]` or `[from, to, weight]`, and the key of the list for messages.
-    index_of
-        The index of each peer by its spellings.
+    index_of, groups
+        The index of each peer by its spellings, and the names of the groups.
     mistakes
         The collector of errors, for each invalid end.
 
@@ -179,16 +203,16 @@ def _arc(pair: Node, subject: str, index_of: Mapping[str, int], mistakes: Mistak
     if not isinstance(pair, Sequence) or len(pair.items) not in (2, 3):
         expected = "two peers and, optionally, a weight"
         raise fault("E203", pair.location, subject, expected, form(pair), "[1, 2]")
-    ends: list[int] = []
+    ends: list[int | str] = []
     for node in pair.items[:2]:
         with mistakes:
             quoted = isinstance(node, Scalar) and node.text.isdigit() and not node.plain
             text = node.text if isinstance(node, Scalar) and not quoted else ""
-            if text not in index_of:
-                expected_peer = f"a number from 1 to {len(index_of) // 2}, or a name in quotes such as "
-                expected_peer += f'"{_example(index_of)}"'
-                raise fault("E213", node.location, "peer", expected_peer, form(node))
-            ends.append(index_of[text])
+            if text not in index_of and text not in groups:
+                expected = f"a number from 1 to {len(index_of) // 2}, a group, or a name in quotes "
+                expected += f'such as "{_example(index_of)}"'
+                raise fault("E213", node.location, "peer", expected, form(node))
+            ends.append(index_of.get(text, text))
     weight = 1.0
     for node in pair.items[2:]:
         number = node.value if isinstance(node, Scalar) else None
@@ -201,8 +225,8 @@ def _arc(pair: Node, subject: str, index_of: Mapping[str, int], mistakes: Mistak
         weight = float(number)
     if len(ends) < 2:
         raise AlreadyReportedError
-    if ends[0] == ends[1] and subject == "edges":
-        message = f"an edge can't connect peer {ends[0] + 1} to itself"
+    if ends[0] == ends[1] and subject == "edges" and ends[0] not in groups:
+        message = f"an edge can't connect {_named(ends[0])} to itself"
         raise fault("E213", pair.location, message, advice="use arcs for a peer that sends to itself")
     return ends[0], ends[1], weight
 

@@ -223,8 +223,8 @@ class PartReader:
         if entry.section == "links":
             parts = self.scope.parts.entries.values()
             user = next((part.name for part in parts if name in part.words), f"a coupler over {name}")
-            message = f"at has no effect on the link {name}"
-            advice = f"set at: [{', '.join(map(form, items)) or groups}] in {user}"
+            message, at = f"at has no effect on the link {name}", ", ".join(map(form, items)) or groups
+            advice = f"set at: [{at}] in {user}, or name the groups in its graph"
             raise fault("E211", node.location, message, advice=advice)
         if not (isinstance(node, Sequence) and items):
             got = "an empty list" if isinstance(node, Sequence) else form(node)

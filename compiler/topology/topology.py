@@ -31,7 +31,7 @@ from apc.compiler.source.source import Source
 from apc.compiler.topology.channels import PROBABILITY
 from apc.compiler.topology.groups import GroupDeclaration, GroupReader, read_counts
 from apc.compiler.topology.instances import PartInstance, PartReader, settable_names
-from apc.compiler.topology.links import LinkDeclaration, read_link, without_range
+from apc.compiler.topology.links import PAIR, LinkDeclaration, read_link, without_range
 from apc.compiler.topology.redeclarations import redeclared
 from apc.compiler.topology.studies import read_experiment, read_studies
 from apc.compiler.topology.timebase import ClockDeclaration, read_clocks
@@ -327,9 +327,11 @@ class _Names:
         link, _, parameter = name.partition(".")
         if link in self.links:
             other = next((name for name in reversed(self.groups) if name != group), group)
-            example = f"{link}: {{delays: {{{group}: {{{other}: {value}}}}}}}"
+            example = f"{link}: {{pairs: {{{group}: {{{other}: {{{parameter}: {value}}}}}}}}}"
+            advice = f"set it in links, as in {example}" if parameter in PAIR else ""
+            if parameter == "clock":
+                advice = f"define a link with this clock and graph: {{arcs: [[{group}, {other}]]}}"
             message = f"{name} belongs to a link and can't be set by a group"
-            advice = f"set it in links, as in {example}"
-            raise fault("E211", location, message, advice=advice if parameter == "delay" else "")
+            raise fault("E211", location, message, advice=advice)
         if self.is_reported(name):
             raise AlreadyReportedError

@@ -98,7 +98,7 @@ def _count(system: Model, group: Group) -> Settable:
     parameter = next(
         parameter for parameter in system.parameters if parameter.name == group_count(group.name)
     )
-    named = [link.name for link in system.links if link.graph.shape == "arcs"]
+    named = [link.name for link in system.links if link.graph.shape == "arcs" and not link.graph.groups]
     local = [column.name for column in group.columns if not counts_peers(column.name)]
     fixed = f"the graph of {named[0]} lists the peers by name" if named else ""
     fixed = f"{local[0]} has a value for each peer" if local else fixed

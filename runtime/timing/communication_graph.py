@@ -170,7 +170,10 @@ def check_mean(
     name = communication_graph.peer_name(peer)
     if not receives:
         message = f"{name} has no incoming connection over {link}, so {operator}() is undefined"
-        raise ApcError(Diagnostic("E801", SourceLocation(communication_graph.topology), message))
+        advice = f"add an arc to {name}"
+        raise ApcError(
+            Diagnostic("E801", SourceLocation(communication_graph.topology), message, advice=advice)
+        )
     if not total:
         message = f"the weights of {name} over {link} add up to 0, so mean() is undefined"
         raise ApcError(Diagnostic("E802", SourceLocation(communication_graph.topology), message))

@@ -318,7 +318,7 @@ def build_peers(system: Model, peers: Sequence[int], groups: Sequence[int], *, l
 def _delays(system: Model, name: str) -> list[str]:
     """Return the timings of all delays of a link."""
     link = next(one for one in system.links if one.name == name)
-    return [link.delay, *(pair.delay for pair in link.delays)]
+    return [*link.delays]
 
 
 class Happening:
@@ -338,7 +338,7 @@ class Happening:
         self.delay: dict[tuple[str, int, int], Fraction] = {}
         names = [group.name for group in system.groups]
         for link in system.links:
-            late = {(names.index(p.sender), names.index(p.receiver)): p.delay for p in link.delays}
+            late = {(names.index(p.sender), names.index(p.receiver)): p.delay for p in link.pairs}
             for h in range(len(names)):
                 for g in range(len(names)):
                     self.delay[link.name, h, g] = self.seconds[late.get((h, g), link.delay)]

@@ -150,3 +150,46 @@ def test_the_limitations_name_the_pair() -> None:
 def test_modelica_refuses_a_lossy_pair_by_name() -> None:
     with pytest.raises(ApcError, match=r"E955 .*packet loss \(2 %\) of lan from lab to far"):
         modelica(compiled(PAIRS))
+
+
+ROOM_ARCS = "[[lab, lab, 0.5], [far, far, 0.5], [lab, far], [far, lab]]"
+PEER_ARCS = (
+    "[[1, 2, 0.5], [2, 1, 0.5], [3, 4, 0.5], [4, 3, 0.5], [1, 3], [1, 4], [2, 3], [2, 4], [3, 1], [3, 2], "
+    "[4, 1], [4, 2]]"
+)
+
+
+def graphed(graph: str, text: str = ROOMS) -> Model:
+    return compiled(replaced(text, ("delay: 2 ms", f"delay: 2 ms, graph: {graph}")))
+
+
+def test_a_graph_of_groups_is_that_of_their_peers() -> None:
+    by_groups, by_peers = graphed(f"{{arcs: {ROOM_ARCS}}}"), graphed(f"{{arcs: {PEER_ARCS}}}")
+    np.testing.assert_allclose(poles(by_groups), poles(by_peers), rtol=0, atol=1e-12)
+    assert poles(by_groups).size
+
+
+def test_edges_of_groups_have_both_directions() -> None:
+    edges = graphed("{edges: [[lab, lab, 0.5], [far, far, 0.5], [lab, far]]}")
+    np.testing.assert_allclose(poles(edges), poles(graphed(f"{{arcs: {ROOM_ARCS}}}")), rtol=0, atol=1e-12)
+
+
+def test_a_group_that_only_receives_leaves_the_others_as_they_are() -> None:
+    """The poles of two users alone are among those with two more that follow them."""
+    alone = replaced(
+        ROOMS, ("shared: true", "shared: false"), ("lab: {count: 2}, far: {count: 2}", "lab: {count: 2}")
+    )
+    watched = graphed("{arcs: [[lab, lab], [lab, far]]}", replaced(ROOMS, ("shared: true", "shared: false")))
+    among, found = poles(watched), poles(compiled(alone))
+    assert found.size and all(np.abs(among - pole).min() < 1e-10 for pole in found)
+    with pytest.raises(ApcError, match=r"E801 lab\[1\] and lab\[2\] .*sum\(\), such as FullMesh"):
+        graphed("{arcs: [[lab, far]]}", replaced(ROOMS, ("FullMesh", "AveragePosition")))
+
+
+def test_a_pair_and_a_graph_of_groups_follow_the_counts() -> None:
+    arcs = "graph: {arcs: [[lab, lab], [lab, far], [far, lab]]}, "
+    text = replaced(PAIRS, ("delay: 2 ms, pairs", f"delay: 2 ms, {arcs}pairs"))
+    written = replaced(text, ("lab: {count: 2}", "lab: {count: 3}"), ("far: {count: 2}", "far: {count: 1}"))
+    assert growth(apc.set_parameters(compiled(text), {"lab.count": "3", "far.count": "1"})) == growth(
+        compiled(written)
+    )

@@ -13,6 +13,13 @@ NAMED = replaced(MESH, ("count: 3", "count: 2*n - 1"), ("peers:", "parameters: {
 GROUPS = replaced(
     AVERAGE, ("  user: {count: 3}", "  left: {count: 2, set: {device.mass: 0.2 kg}}\n  right: {count: 3}")
 )
+# Weights whose sums are no floats, and a group that only receives.
+ROOMS = replaced(
+    AVERAGE,
+    ("user: {count: 3}", "lab: {count: 2}\n  user: {count: 3}\n  observer: {count: 2}"),
+    ("delay: 8 ms}", "delay: 8 ms, graph: {arcs: [[lab, lab, 0.3], [user, user, 0.3], [lab, user, 0.1], "
+     "[user, lab, 0.1], [lab, observer], [user, observer, 0.7]]}}"),
+)  # fmt: skip
 RING, STAR = (replaced(MESH, ("delay: 8 ms}", f"delay: 8 ms, graph: {name}}}")) for name in ("ring", "star"))
 EDGES = "{edges: [[1, 2], [2, 3]]}"
 
@@ -27,7 +34,7 @@ def plain(system: Model) -> tuple[object, ...]:
 
 @pytest.mark.few(4)
 @pytest.mark.parametrize("count", [2, 7, 40])
-@pytest.mark.parametrize("text", [AVERAGE, RING, STAR], ids=["average", "ring", "star"])
+@pytest.mark.parametrize("text", [AVERAGE, RING, STAR, ROOMS], ids=["average", "ring", "star", "rooms"])
 def test_a_model_with_another_count_is_the_one_that_compiles(text: str, count: int) -> None:
     changed = apc.set_parameters(compiled(text), {"user.count": str(count)})
     assert plain(changed) == plain(compiled(replaced(text, ("count: 3", f"count: {count}"))))
@@ -67,7 +74,13 @@ def test_so_it_is_with_groups_and_with_counts_that_follow_from_numbers() -> None
         (
             replaced(AVERAGE, ("delay: 8 ms}", f"delay: 8 ms, graph: {EDGES}}}")),
             "user.count=4",
-            "E626 the graph of lan lists peers by number; user.count can't be changed.",
+            "E626 the graph of lan lists peers by number; user.count can't be changed. "
+            "Name the groups in the graph, as in [user, user].",
+        ),
+        (
+            replaced(AVERAGE, ("delay: 8 ms}", "delay: 8 ms, graph: {arcs: [[user, user]]}}")),
+            "user.count=2000",
+            "E626 graph: expected at most 2,000,000 arcs, got 4,000,000. Use graph: complete.",
         ),
         (
             RING,
