@@ -22,8 +22,10 @@ KEPT = {
     "lifted-box": [(4, 2, 2)],
     "lossy-average": [(4, 2, 2)],
     "mixed-clocks": [(4, 2, 10), (4, 2, 10)],  # 40 ms are five frames
+    "observer": [(4, 2, 2)],
     "planar-users": [(8, 4, 4)],  # the paper's, along either axis
     "ring-of-eight": [(4, 2, 2)],
+    "sixty-hertz-user": [(4, 3, 4)],  # two forces of coordination, a packet over each link
     "star-lecture": [(4, 2, 4)],  # 20 ms are two frames
     "template": [(4, 2, 2)],
     "three-users-average": [(4, 2, 2)],
@@ -31,6 +33,7 @@ KEPT = {
     "three-users-predicted": [(4, 2, 2)],
     "three-users-scheduled": [(4, 2, 1)],  # no velocity is sent
     "two-handed-tool": [(6, 2, 2)],  # two devices and a copy; the tool is midway
+    "two-rooms": [(4, 2, 8)],  # 30 ms are four frames
     "two-users-damped": [(4, 2, 2)],
     "two-users-proxies": [(4, 2, 2)],
     "two-users-reported": [(4, 5, 1)],  # the mean as it grows, and what was told, at either clock
