@@ -149,7 +149,7 @@ def _time(system: Model, timing: Timing) -> Settable:
             description = f"period of clock {clock.name}"
         if timing.name == clock.phase:
             description = f"first tick of clock {clock.name}, below its period"
-    if any(timing.name == link.delay for link in system.links):
+    if any(timing.name in link.delays for link in system.links):
         description = "from sending a packet to its availability at the receiver"
     text = next(
         (parameter.description for parameter in system.parameters if parameter.name == timing.name),

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from apc.compiler.compiled import Model
+from apc.compiler.compiled import Link, Model
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.network.nominal_criterion import channel_numbers
 from apc.parameter_values.parameter_names import ParameterRef, find, times_of, unit_of
@@ -122,8 +122,10 @@ def _default_names(system: Model, axis: str) -> list[str]:
     if axis == DELAY:
         return _roots(system, [link.delay for link in links], ("s",))
     if axis == LOSS:
-        losses = [channel.loss for link in links for channel in link.channels]
-        return _roots(system, [loss.p for loss in losses if loss is not None], ("1",))
+        of_links = [link.channel.loss.p for link in links if link.channel and link.channel.loss]
+        of_pairs = _losses_of_pairs(links)
+        names = _roots(system, of_links or of_pairs, ("1",))
+        return names if of_links or len(names) == 1 else []
     receiving_parts = {
         channel.rpartition(".")[0]
         for peer_type in system.peer_types
@@ -133,6 +135,12 @@ def _default_names(system: Model, axis: str) -> list[str]:
     }
     stiff = [parameter.name for parameter in system.parameters if parameter.unit in STIFFNESSES]
     return _roots(system, [name for name in stiff if name.rpartition(".")[0] in receiving_parts], STIFFNESSES)
+
+
+def _losses_of_pairs(links: Iterable[Link]) -> list[str]:
+    """Return the loss probabilities of pairs of groups."""
+    channels = [pair.channel for link in links for pair in link.pairs]
+    return [channel.loss.p for channel in channels if channel and channel.loss]
 
 
 def _roots(system: Model, names: Iterable[str], units: Sequence[str]) -> list[str]:
@@ -167,5 +175,7 @@ def _nothing(system: Model, axis: str) -> str:
         return "there is no link"
     if axis == DELAY:
         return "no peer receives over a link"
+    if losses := _losses_of_pairs(system.links):
+        return f"several pairs of groups have a loss (choose one with --over {losses[0]})"
     names = " and ".join(link.name for link in system.links)
     return f"no link has a loss; write loss: 0 % at {names} to vary it"

@@ -11,9 +11,12 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 import apc
+from apc.app.yaml_edit import with_values
 from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError
 from apc.exports.modelica import modelica
+from apc.parameter_values.parameter_names import ParameterRef
+from apc.studies.choice import LOSS, choose
 from tests.bruteforce import PacketOutcomes, TopologySource, lossy_frame, states_read
 from tests.topologies import TOPOLOGIES, compiled, replaced
 from tests.truths import text_of
@@ -223,3 +226,23 @@ def test_the_shipped_rooms_follow_the_counts_from_two_to_eight_users() -> None:
     model = compiled((TOPOLOGIES / "two-rooms.yaml").read_text(encoding="utf-8"))
     for count in range(1, 5):
         assert growth(apc.set_parameters(model, {"lab.count": str(count), "remote.count": str(count)})) < 1
+
+
+def test_a_pair_is_written_back_at_its_place() -> None:
+    """A delay that followed that of the link gets a key of its own."""
+    text = replaced(PAIRS, ("far: {delay: 30 ms, loss: 2 %}", "far: {loss: 2 %}"))
+    values = {"lan.pairs.lab.far.loss": "7 %", "lan.pairs.lab.far.delay": "9 ms"}
+    found = with_values(text, compiled(text), {ParameterRef(name): value for name, value in values.items()})
+    assert "far: {loss: 7 %, delay: 9 ms}" in found
+
+
+def test_one_loss_of_several_pairs_is_the_loss_that_is_compared() -> None:
+    shared = replaced(
+        PAIRS,
+        (f"{{far: {{{WAN}}}}}", "{far: {loss: q}}"),
+        (f"{{lab: {{{WAN}}}}}", "{lab: {loss: q}}"),
+        ("peers:", "parameters: {q: 2 %}\npeers:"),
+    )
+    assert choose(compiled(shared), ())[LOSS].name == "q"
+    several = choose(compiled(PAIRS), ())[LOSS]
+    assert not several.name and "--over lan.pairs.lab.far.loss" in several.why
