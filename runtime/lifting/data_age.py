@@ -149,7 +149,7 @@ def _ages_of_ticks(
     period = {name: timings[clock_of[name].period] for name in names}
     phase = {name: timings[clock_of[name].phase] % period[name] for name in names}
     tick_period = period[partition.clock]
-    delay_by_link = {link: timings[_single_delay(system, exchange, peer_type_index, link)] for link in links}
+    delay_by_link = {link: _single_delay(system, exchange, timings, peer_type_index, link) for link in links}
     result = []
     for tick in range(int(common_multiple(period.values()) / tick_period)):
         time = phase[partition.clock] + tick * tick_period
@@ -168,8 +168,14 @@ def _ages_of_ticks(
     return tuple(result)
 
 
-def _single_delay(system: Model, exchange: CommunicationGraph, peer_type_index: int, link: str) -> str:
-    """Return the timing of the delay with which all peers of a type receive from all others over a link.
+def _single_delay(
+    system: Model,
+    exchange: CommunicationGraph,
+    timings: Mapping[str, Fraction],
+    peer_type_index: int,
+    link: str,
+) -> Fraction:
+    """Return the delay in seconds with which all peers of a type receive from all others over a link.
 
     Raises
     ------
@@ -177,14 +183,15 @@ def _single_delay(system: Model, exchange: CommunicationGraph, peer_type_index: 
         E811 several delays.
     """
     receivers = [index for index, group in enumerate(system.groups) if group.peer_type == peer_type_index]
-    delays = {
+    delay_names = {
         exchange.delay(link, sender, receiver)
         for receiver in receivers
         for sender in range(len(system.groups))
         if sender != receiver or system.groups[sender].count > 1
     }
+    delays = {timings[name] for name in delay_names or {exchange.default_delay[link]}}
     if len(delays) > 1:
-        names = ", ".join(sorted(delays))
+        names = ", ".join(sorted(delay_names))
         message = (
             f"the age of samples received by {system.peer_types[peer_type_index].name} over {link} differs "
             f"between senders ({names}); different ages can be simulated but not analyzed"
@@ -192,7 +199,7 @@ def _single_delay(system: Model, exchange: CommunicationGraph, peer_type_index: 
         raise ApcError(
             Diagnostic("E811", SourceLocation(system.origin.topology), message, fix="apc simulate")
         )
-    return delays.pop() if delays else exchange.default_delay[link]
+    return delays.pop()
 
 
 @functools.lru_cache(maxsize=CACHE_SIZE)

@@ -15,8 +15,10 @@ from apc.app.yaml_edit import with_values
 from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError
 from apc.exports.modelica import modelica
+from apc.extensions.loss_models.time_varying_delay import loop_gain
 from apc.parameter_values.parameter_names import ParameterRef
 from apc.studies.choice import LOSS, choose
+from apc.support.not_supported import NotSupportedError
 from tests.bruteforce import PacketOutcomes, TopologySource, lossy_frame, states_read
 from tests.topologies import TOPOLOGIES, compiled, replaced
 from tests.truths import text_of
@@ -246,3 +248,51 @@ def test_one_loss_of_several_pairs_is_the_loss_that_is_compared() -> None:
     assert choose(compiled(shared), ())[LOSS].name == "q"
     several = choose(compiled(PAIRS), ())[LOSS]
     assert not several.name and "--over lan.pairs.lab.far.loss" in several.why
+
+
+def each_pair(channel: str, groups: tuple[str, ...]) -> str:
+    """Return the pairs of some groups with a channel, two of which are one group."""
+    received = ", ".join(f"{name}: {{{channel}}}" for name in groups)
+    return f"pairs: {{{', '.join(f'{name}: {{{received}}}' for name in groups)}}}"
+
+
+@pytest.mark.parametrize(
+    ("channel", "count"),
+    [
+        ("loss: 20 %", 2),
+        ("loss: 20 %, jitter: 1.5 ms", 1),
+        ("loss: {p: 10 %, r: 30 %}", 1),
+    ],
+)
+def test_equal_channels_of_all_pairs_are_that_of_the_link(channel: str, count: int) -> None:
+    text = replaced(
+        ROOMS, ("{lab: {count: 2}, far: {count: 2}}", f"{{lab: {{count: {count}}}, far: {{count: {count}}}}}")
+    )
+    one, every = (
+        compiled(replaced(text, ("delay: 2 ms}", f"delay: 2 ms, {keys}}}")))
+        for keys in (channel, each_pair(channel, ("lab", "far")))
+    )
+    assert growth(every) == pytest.approx(growth(one), rel=1e-9)
+
+
+def test_a_pair_that_replaces_lost_packets_is_not_judged_and_says_why() -> None:
+    found = apc.mean_square_stability(
+        compiled(replaced(PAIRS, ("lab: {far: {", "lab: {far: {on_loss: zero, ")))
+    )
+    assert found is not None and found.stable is None
+    assert any(
+        "substituted values together with packets of another link or delay" in note for note in found.notes
+    )
+
+
+def test_a_range_that_pairs_follow_is_not_proved_for_changing_delays() -> None:
+    text = replaced(PAIRS, ("lab: {far: {delay: 30 ms, ", "lab: {far: {"))
+    with pytest.raises(NotSupportedError, match=r"several pairs of groups depend on lan\.delay"):
+        loop_gain(compiled(text), ParameterRef("lan.delay"), 2 * MS, 6 * MS)
+
+
+def test_the_age_of_packets_is_known_if_pairs_differ_in_loss_only() -> None:
+    text = (TOPOLOGIES / "three-users-scheduled.yaml").read_text(encoding="utf-8")
+    groups = replaced(text, ("user: {count: 3}", "user: {count: 2}\n  far: {count: 1}"))
+    lossy = replaced(groups, ("loss: 0 %", "loss: 0 %, pairs: {user: {far: {loss: 5 %}}}"))
+    assert distance(compiled(lossy), compiled(groups)) < 1e-12
