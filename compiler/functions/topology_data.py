@@ -241,7 +241,7 @@ def check_links(topology: Topology, peer_types: Sequence[PeerType], indices: Seq
         advice = f"add an arc to {'each of them' if len(deaf) > 1 else names[0]}"
         receiving = np.bincount(owner[deaf], minlength=len(groups)) < counts
         if np.isin(deaf, senders).any():
-            advice += ", or use a coupler with sum(), such as FullMesh, at peers that only send"
+            advice += ", or use a coupler with sum(), such as FullMesh"
         elif not receiving.all() and receiving.any():
             others = [group.name for group, receives in zip(groups, receiving, strict=True) if receives]
             advice += f", or use at: [{', '.join(others)}] in the couplers of {link.name}"
