@@ -389,7 +389,10 @@ def _margin_points(system: Model, parameter_ref: ParameterRef, scale: float) -> 
             for delay in link.delays
             if (channel := link.channel_at(delay)) and channel.jitter == parameter_ref.name
         ]
-        points = np.linspace(present, min([most, *delays]), SHARES + 1)
+        most = min([most, *delays])
+        if not np.isfinite(most):  # a named number that a loss or a jitter depends on
+            most = 1.0 if unit_of(system, parameter_ref.name) == "1" else GROWTH * abs(scale)
+        points = np.linspace(present, most, SHARES + 1)
         return points, float(points[1])
     if not scale:
         return np.array([present]), 1.0

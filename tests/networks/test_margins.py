@@ -35,6 +35,15 @@ def test_over_another_network_a_margin_is_another() -> None:
     assert found[STIFFNESS] == pytest.approx(1384, abs=1)
 
 
+def test_a_loss_with_a_name_of_its_own_has_the_margin_of_the_loss() -> None:
+    """The name has no largest value: it is varied up to 100 %, as the loss is."""
+    text = replaced(AVERAGE, ("count: 3", "count: 2"), ("delay: 8 ms}", "delay: 8 ms, loss: 2 %}"))
+    named = replaced(text, ("loss: 2 %", "loss: q"), ("peers:", "parameters: {q: 2 %}\npeers:"))
+    direct, found = ({row.parameter: row for row in grown(compiled(one)).rows} for one in (text, named))
+    assert found["q"].searched_to == direct["lan.loss"].searched_to
+    assert found["q"].value is direct["lan.loss"].value is None
+
+
 def test_derivatives_are_those_of_moments_followed_event_by_event() -> None:
     system = system_of(topology(2, 900.0))
     found = {row.parameter: row for row in network_sensitivities(numeric_model(system)).rows}
