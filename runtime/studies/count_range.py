@@ -56,7 +56,8 @@ def count_range(
     low, high = limits
     of_group = any(parameter_ref.name == group_count(group.name) for group in system.groups)
     other_peers = system.peers - int(present) if of_group else 0
-    first = _integer_limit(low, max(1, least_peers(system.peer_types) - other_peers), location)
+    least = max(_least_count(system, parameter_ref.name), least_peers(system.peer_types) - other_peers)
+    first = _integer_limit(low, least, location)
     incomplete_graph = any(link.graph.shape != "complete" for link in system.links)
     span = PLACED_SPAN if incomplete_graph else SPAN  # there each peer has an index in the graph
     largest_allowed = min(
@@ -70,6 +71,27 @@ def count_range(
     return first, _integer_limit(
         high, int(min(max(math.ceil(span * present), first + 1), largest_allowed)), location
     )
+
+
+def _least_count(system: Model, count: str) -> int:
+    """Return the smallest count of a group: two if a mean, maximum or minimum receives from it alone, else 1.
+
+    `count` is the name of a parameter; that of no group has the limit 1.
+    """
+    reduced = {
+        receive.link
+        for peer_type in system.peer_types
+        for partition in peer_type.clocks
+        for receive in partition.receives
+        if receive.operator != "sum"
+    }
+    for link in system.links:
+        senders: dict[str, set[str]] = {}
+        for sender, receiver, _ in link.graph.groups if link.name in reduced else ():
+            senders.setdefault(group_count(receiver), set()).add(group_count(sender))
+        if senders.get(count) == {count}:
+            return 2
+    return 1
 
 
 def _integer_limit(limit: Fraction | None, default: int, location: SourceLocation) -> int:

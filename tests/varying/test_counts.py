@@ -119,3 +119,15 @@ def test_a_count_by_names_is_read_with_care(count: str, message: str) -> None:
     with pytest.raises(ApcError) as caught:
         compiled(text)
     assert message in str(caught.value)
+
+
+def test_a_mean_over_its_own_group_needs_two_of_them() -> None:
+    """One user alone would hear nobody; an observer may be alone."""
+    graph = "graph: {arcs: [[user, user], [user, observer]]}"
+    text = replaced(
+        AVERAGE,
+        ("user: {count: 3}", "user: {count: 3}\n  observer: {count: 1}"),
+        ("delay: 8 ms}", f"delay: 8 ms, {graph}}}"),
+    )
+    found = [apc.critical(compiled(text), f"{name}.count", upper=4) for name in ("user", "observer")]
+    assert [one.searched_to[0] for one in found] == [2, 1]
