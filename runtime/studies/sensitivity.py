@@ -343,8 +343,7 @@ def channel_parameters(system: Model) -> list[ParameterRef]:
     Of a link with independent losses, `loss: 2 %`, the probabilities of bursts are left out.
     """
     holder, numbers = scope_of(system).holder, set(channel_numbers(system))
-    for link in system.links:
-        loss = None if link.channel is None else link.channel.loss
+    for loss in (channel.loss for link in system.links for channel in link.channels):
         if loss is not None and holder[loss.r].formula is not None:
             numbers -= {loss.one_minus_h, loss.one_minus_k}
     times = [ParameterRef(timing.name) for timing in named_times(system) if timing.formula is None]

@@ -134,9 +134,9 @@ def _check_links(system: Model, presence: Presence, mistakes: Mistakes) -> None:
     for link in system.links:
         graphs = ["complete", *["star"] * constant_hub, *["ring"] * (link.channel is None)]
         permitted = [("graph", link.graph.shape, graphs)]
-        if link.channel is not None:
-            permitted += [("on_loss", link.channel.on_loss, ["hold"])]
-            permitted += [("reorder", link.channel.reorder, ["newest"])]
+        for channel in link.channels:
+            permitted += [("on_loss", channel.on_loss, ["hold"])]
+            permitted += [("reorder", channel.reorder, ["newest"])]
         for word, value, allowed in permitted:
             if value not in allowed:
                 subject, got = f"{word} of {link.name} with joins or leaves", value.replace("arcs", "a list")
