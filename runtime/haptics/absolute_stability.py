@@ -322,7 +322,7 @@ def passivity_radius(numeric: NumericModel, *, bounded: bool = True) -> Stabilit
     radius, low, high = (
         max(getattr(growth, name) for growth in growths) for name in ("radius", "low", "high")
     )
-    return StabilityMeasure(radius, low, high, exact=True, proved=True)
+    return StabilityMeasure(radius, low, high, exact=True, proved=bounded)
 
 
 def loop_growths(numeric: NumericModel, *, bounded: bool = True) -> list[StabilityMeasure]:

@@ -223,7 +223,7 @@ def independent_growth(
     inner = enclose_growth(of.operator, bounded=bounded)
     quick = of.entries * of.states**3 <= QUICK
     return StabilityMeasure(
-        inner.radius, inner.low, inner.high, True, proved=True, quick=quick, errors=errors
+        inner.radius, inner.low, inner.high, True, proved=bounded, quick=quick, errors=errors
     )
 
 

@@ -94,8 +94,9 @@ ESTIMATE = StabilityProof(ProofMethod.ESTIMATED)
 class Verdict:
     """The verdict at one value: `stable` is None if undecided.
 
-    `radius` is the spectral radius, with the bound `error` on its error; `frequencies` contains the frequency
-    of the dominant mode in Hz, and is empty without modes; `proof` is the method of the proof.
+    `radius` is the spectral radius, with the bound `error` on its error, NaN without a bound; `frequencies`
+    contains the frequency of the dominant mode in Hz, and is empty without modes; `proof` is the method of
+    the proof.
     """
 
     stable: bool | None

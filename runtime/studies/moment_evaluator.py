@@ -42,7 +42,12 @@ from apc.studies.crossing import Verdict
 from apc.studies.evaluator import generic, reaches_count, reaches_time
 from apc.studies.frame_matrices import STEP, BatchEvaluator, batch_evaluator
 from apc.studies.parameter_path import OPEN
-from apc.studies.stability_criteria import BOUNDED, MEAN_SQUARE, NOWHERE, RadiusEvaluator
+from apc.studies.stability_criteria import (
+    MEAN_SQUARE,
+    NOWHERE,
+    RadiusEvaluator,
+    unbounded_verdict,
+)
 
 Floats = NDArray[np.float64]
 
@@ -88,7 +93,7 @@ class MomentEvaluator(RadiusEvaluator):
                 raise
             return OPEN
         radius = growth(moments.operator)
-        return Verdict(radius < 1, radius, 0.0, (), BOUNDED[MEAN_SQUARE]) if np.isfinite(radius) else OPEN
+        return unbounded_verdict(radius)
 
     def slopes(self, values: Floats, along: Floats) -> tuple[tuple[Floats, Floats], ...]:
         """Return the root of the growth (k, 1, 1) and its derivatives along directions (k, m)."""

@@ -162,8 +162,7 @@ def verdict_with(
     if criterion == NOMINAL and bounded:
         return verdict_of(analyze(changed))
     if criterion == NOMINAL:
-        radius = abs(dominant_in_floats(changed))
-        return Verdict(radius < 1, radius, math.nan, (), NO_PROOF) if math.isfinite(radius) else OPEN
+        return unbounded_verdict(abs(dominant_in_floats(changed)))
     # Imported when needed: most models need neither.
     if criterion == PASSIVE:
         from apc.haptics.absolute_stability import passivity_radius
@@ -180,9 +179,16 @@ def verdict_with(
             fix = "apc simulate" if aged(numeric.model) else ""
             advice = "" if fix else "narrow the range between --lower and --upper"
         raise ApcError(Diagnostic("E898", location, message, fix=fix, advice=advice))
+    if not bounded:
+        return unbounded_verdict(result.radius)
     proof = TAGGED if not result.exact else BOUNDED[criterion] if result.proved else ITERATED
     error = max(result.high - result.radius, result.radius - result.low)
     return Verdict(result.stable, result.radius, error, (), proof)
+
+
+def unbounded_verdict(radius: float) -> Verdict:
+    """Return the verdict of a radius in floats, without a bound; undecided if it is not finite."""
+    return Verdict(radius < 1, radius, math.nan, (), NO_PROOF) if math.isfinite(radius) else OPEN
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -229,7 +235,7 @@ class RadiusEvaluator:
         except ApcError:
             return OPEN
         if math.isfinite(radius):
-            return Verdict(radius < 1, radius, math.nan, (), NO_PROOF)
+            return unbounded_verdict(radius)
         return self.verdict(value, bounded=True)  # an analysis avoids matrices that are too large
 
     def dominant(self, value: Sequence[float]) -> complex:
