@@ -53,8 +53,8 @@ CACHE_SIZE_OF_SUBSYSTEM, SUBSYSTEM_AT_WORK = 200, 6000
 class AnalysisPlan:
     """The method of an analysis, with the classes of equal peers and their loops.
 
-    Classes and loops are empty for thousands of peers. `systems` are the (count, size) of the systems to
-    solve: states, or rows of a determinant.
+    Classes and loops are empty for many different peers (see `FEW_STATES`). `systems` are the (count, size)
+    of the systems to solve: states, or rows of a determinant.
     """
 
     method: str
@@ -216,7 +216,7 @@ def _determinant_memory(loop: ModalSystem) -> int:
 
 
 def not_populations(system: Model, jacobians: Sequence[SubsystemJacobians]) -> str:
-    """Return the reason why the method for thousands of peers is not applicable, "" if it is applicable."""
+    """Return the reason why the method for many different peers is not applicable, "" if it is applicable."""
     for peer_type, subsystem in zip(system.peer_types, jacobians, strict=True):
         if subsystem.edges:
             return f"{peer_type.name} depends on individual senders"
@@ -236,7 +236,7 @@ def _is_short_and_complete(numeric: NumericModel) -> bool:
 
 
 def _plan_populations(numeric: NumericModel) -> AnalysisPlan:
-    """Return the plan for thousands of peers on complete graphs: one determinant of all sent values."""
+    """Return the plan for many different peers on complete graphs: one determinant of all sent values."""
     rows = {
         (numeric.exchange.delay_class(index), sent)
         for index, schedule in enumerate(numeric.schedules)

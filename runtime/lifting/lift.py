@@ -10,8 +10,9 @@ Does not: connect peers (see `modes`).
     z⁺ = P z + Q r        z: continuous states, then discrete states (`Schedule.discrete_states`)
     s  = S z + D r        r: received values (`Schedule.received`), s: sent values (`Schedule.sent`)
 
-D is the part of s that depends on values received in the same frame: nilpotent, as no value is received
-before it is sent.
+In the notation of state space models (A, B, C, D) = (P, Q, S, D). D is the part of s that depends on values
+received in the same frame. With the weights W of these values D W is nilpotent: no value is received before
+it is sent.
 """
 
 from __future__ import annotations
@@ -225,14 +226,14 @@ def _apply_repeats(
     dict(propagation.advance(body, single, lambda row: unit[..., n + row, :]))
     step = _stack_rows(single.moving[..., :n_x, :], [row_of(single, value, 1) for value in repeated.entering])
 
-    def after(repetitions: Matrix, earlier: Matrix) -> Matrix:
+    def composed(later: Matrix, earlier: Matrix) -> Matrix:
         """Return the map (T, R) of the repetitions of `earlier`, followed by those of `later`."""
-        values = numbers.multiply(repetitions[..., :n_y], earlier)
-        values[..., n_y:] = numbers.add(values[..., n_y:], repetitions[..., n_y:])
+        values = numbers.multiply(later[..., :n_y], earlier)
+        values[..., n_y:] = numbers.add(values[..., n_y:], later[..., n_y:])
         return values
 
     y = _stack_rows(present.moving[..., :n_x, :], [row_of(present, value, 0) for value in needed])
-    power = _repeated_map(step, repeated.count, after)
+    power = _repeated_map(step, repeated.count, composed)
     values = numbers.add(numbers.multiply(power[..., :n], y), numbers.multiply(power[..., n:], received))
     present.moving[..., :n_x, :] = values[..., :n_x, :]
     for position, value in enumerate(repeated.entering, n_x):
@@ -242,18 +243,18 @@ def _apply_repeats(
             present.value[named_at(value, repeated.count)] = values[..., position, :]
 
 
-def _repeated_map(step: Matrix, count: int, after: Callable[[Matrix, Matrix], Matrix]) -> Matrix:
+def _repeated_map(step: Matrix, count: int, composed: Callable[[Matrix, Matrix], Matrix]) -> Matrix:
     """Return the map of `count` repetitions from the map of one repetition and the composition of
     two maps.
     """
     result = None
     while True:
         if count % 2:
-            result = step if result is None else after(step, result)
+            result = step if result is None else composed(step, result)
         count //= 2
         if not count:
             break
-        step = after(step, step)
+        step = composed(step, step)
     assert result is not None
     return result
 
@@ -289,7 +290,7 @@ def follow(
         The number type.
     watch
         Is called before each step with the duration in quanta, the continuous states above the outputs of
-        holds (n_x + n_u, columns), and a table of computed values that it may extend. Without `watch`,
+        holds (n_x + n_u, columns), and a live view of the computed values. Without `watch`,
         repeated events are composed once.
 
     Yields

@@ -5,8 +5,8 @@ Gives: `Mode`, `ModeMotion`, `Spectrum`, `solve_spectrum`, `mode_near`; `complet
 `oscillation`, `finite`; `combine_verdicts`, `up_to`.
 Guarantees: rigid modes are removed before any eigenvalue is computed; every reported error bounds all
 rounding since the subsystem's coefficients. Cases undecided in floats are proved in balls where possible (see
-`certify`), or reported as undecided.
-Does not: close the loop (see `modes`).
+`certification`), or reported as undecided.
+Does not: close the loop (see `interconnection`).
 """
 
 from __future__ import annotations
@@ -119,11 +119,12 @@ class Mode:
 class Spectrum:
     """All modes but the rigid ones, the largest first, with the verdict.
 
-    `spectral_radius` is per frame; `stable` is None when the verdict is undecided. The error bounds the
-    radius from both sides, the verdict needs one: without a tight lower bound, a system can be stable by less
-    than its error. `proof` states the result of ball arithmetic, "" where floats decided; `notes` state the
-    unproved parts. `radius_excess` bounds the excess of the radius over 1 from below and above, if it was
-    proved; the excess can be smaller than the rounding of floats near 1.
+    `spectral_radius` is per frame; `stable` is None when the verdict is undecided. `spectral_radius_error`
+    bounds the deviation on both sides. The verdict needs the upper bound only: a model can be proved stable
+    although radius plus error exceeds 1. `drifts` is the number of motions that grow linearly. `proof` is the
+    result of ball arithmetic, `NO_PROOF` where floats decided; `notes` state the unproved parts.
+    `radius_excess` bounds the excess of the radius over 1 from below and above, if it was proved; the excess
+    can be smaller than the rounding of floats near 1.
     """
 
     modes: Sequence[Mode]

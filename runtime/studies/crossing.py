@@ -146,7 +146,7 @@ class SmoothSegment:
     values. `sample_at` returns the eigenvalues (k, n) and their slopes (k, n) at values (k,), NaN if
     undefined; `verdict_at` the verdict of an analysis at a value. `slow`: each value is expensive.
     `decided_at` returns the verdicts at several values that one evaluation decides, None for the others.
-    `quick_at` returns the verdict at a value where samples have no slopes, and are moved off the circle.
+    `quick_at` returns a verdict without error bounds, for segments whose samples have no slopes.
     """
 
     low: Fraction
@@ -193,7 +193,7 @@ class SingleSegment:
 
     def change(self, before: SmoothSegment, after: SmoothSegment, *, stable_below: bool) -> Crossing:
         """Raise an assertion error: a path of one segment has no crossing between segments."""
-        raise AssertionError("a line of one stretch has no jump")
+        raise AssertionError("a path of one segment has no jump")
 
 
 @dataclass(frozen=True, slots=True)
@@ -203,10 +203,10 @@ class CrossingReport:
     `edges` are the crossings in order, and `stable` the verdicts of the intervals between them, one more than
     there are crossings; empty if no sample has a verdict. `evaluations` is the number of evaluations;
     `complete` is False if an eigenvalue is so near to the circle that some cell could not be resolved;
-    `has_effect` states whether any eigenvalue changed; `classified` whether each first sample, except samples
-    next to 0, has a verdict; `undecided` are the undecided intervals; `why` is the reason if the search ended
-    early. `isolated` are ends of a segment at which the verdict differs from that at all neighbouring values:
-    for example a stiffness of 0.
+    `has_effect` states whether an eigenvalue changed, or the path has several segments; `classified` whether
+    each first sample, except samples next to 0, has a verdict; `undecided` are the undecided intervals; `why`
+    is the reason if the search ended early. `isolated` are ends of a segment at which the verdict differs
+    from that at all neighbouring values: for example a stiffness of 0.
     """
 
     edges: tuple[Crossing, ...]
@@ -341,7 +341,7 @@ def search(path: ParameterPath, *, first: bool = False, progress: Progress | Non
         isolated += isolated_ends
         stable_at = (samples.log_radius < 0).tolist()
         if stable and stable[-1] != stable_at[0]:
-            assert previous is not None, "a side comes of a stretch"
+            assert previous is not None, "a verdict comes from a segment"
             edges.append(path.change(previous, segment, stable_below=stable[-1]))
         if not stable or stable[-1] != stable_at[0]:
             stable.append(stable_at[0])

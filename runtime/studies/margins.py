@@ -380,7 +380,9 @@ def network_margins(numeric: NumericModel, nominal: Margins, *, quick: bool = Fa
 
 
 def _margin_points(system: Model, parameter_ref: ParameterRef, scale: float) -> tuple[Floats, float]:
-    """Return the sampled values of a parameter, analyzed one by one, and the smallest cell width."""
+    """Return the sampled values of a parameter, analyzed one by one, and the value below which cells no
+    longer become narrower.
+    """
     present, most = value_now(system, parameter_ref), allowed(system, parameter_ref)[1]
     if parameter_ref.name in channel_numbers(system):
         delays = [

@@ -2,7 +2,8 @@
 
 Takes: a `Model` and the name of a parameter, also of its links' losses.
 Gives: `MEAN_SQUARE`, `NOMINAL`, `PASSIVE`, `SCALAR_CRITERIA`, `criterion_of`, `refuse_timing_parameter`;
-`PointwisePath`, `line_points`, `BOUNDED`; `verdict_with`, `allowed`; `RadiusEvaluator`.
+`PointwisePath`, `line_points`, `BOUNDED`; `verdict_with`, `unbounded_verdict`, `allowed`;
+`RadiusEvaluator`.
 Guarantees: a verdict follows from bounds on the growth of second moments, or on the energy that passive hands
 can extract, expressed as a growth (see `absolute_stability.passivity_radius`); nominally, from the analysis
 itself.
@@ -44,7 +45,7 @@ MEAN_SQUARE, NOMINAL, PASSIVE = "mean-square", "nominal", "passive"
 # The scalar criteria, and the text of the verdict for each.
 SCALAR_CRITERIA = {MEAN_SQUARE: "in mean square", PASSIVE: "with passive hands"}
 
-# The method by which a crossing is cached.
+# The proof of a crossing, by criterion.
 BOUNDED = {
     MEAN_SQUARE: StabilityProof(ProofMethod.BOUNDED_MOMENTS),
     PASSIVE: StabilityProof(ProofMethod.BOUNDED_HANDS),
@@ -193,7 +194,7 @@ def unbounded_verdict(radius: float) -> Verdict:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RadiusEvaluator:
-    """A `MatrixSource` of one number at each point, as a matrix (1, 1): the value of the criterion.
+    """Evaluates a criterion at each point, as a matrix (1, 1): a search treats the number as an eigenvalue.
 
     `free` are the parameters of a point, `location` is that of errors. By a growth criterion the value is the
     root of the growth per frame. Derivatives are differences over a small part of the directions, with a
@@ -352,14 +353,15 @@ class PointwisePath(SingleSegment):
 def line_points(
     system: Model, parameter_ref: ParameterRef, low: float | None, high: float | None, scale: float
 ) -> tuple[Floats, float]:
-    """Return the first samples along a parameter, and the smallest scale of cell widths.
+    """Return the first samples along a parameter, and the value below which cells no longer become narrower.
 
     Parameters
     ----------
     system, parameter_ref
         The compiled model and the parameter that varies.
     low, high
-        The range; by default, 0 to 1 for a probability, otherwise from 0 (for a negative value, from `SPAN`
+        The range; by default, for a probability 0 (or one sample, where 0 is excluded) to one sample
+        below 1, otherwise from 0 (for a negative value, from `SPAN`
         times the value) to `SPAN` times the scale.
     scale
         The present value, or a substitute for 0.
