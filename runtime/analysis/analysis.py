@@ -1,7 +1,7 @@
 """Stability analysis: from a compiled model to its spectrum and verdict.
 
 Takes: a `NumericModel`.
-Gives: `Analysis`, `analyze`; `prepare_at_start` for many analyses of one model; `lifted_groups`;
+Gives: `Analysis`, `analyze`; `prepare_at_start` for many analyses of one model; `lifted_classes`;
 `near_start`; `analyze_sides`, `analyze_worst_side`; `determinant_radius`.
 Guarantees: the cost grows with the number of different peers, not of all, and not with the length of a delay;
 equal input gives equal output.
@@ -36,7 +36,13 @@ from apc.spectrum.enclosure import WIDE
 from apc.spectrum.equilibrium import equilibrium_residual
 from apc.spectrum.interconnection import ModalSystem, close_loop
 from apc.spectrum.modes import decompose
-from apc.spectrum.peer_classes import PeerClass, peer_groups, representatives, states_of, used_coupling_terms
+from apc.spectrum.peer_classes import (
+    PeerClass,
+    classes_of_peers,
+    representatives,
+    states_of,
+    used_coupling_terms,
+)
 from apc.spectrum.rigid_modes import NeutralModes, classify_neutral_modes
 from apc.spectrum.spectrum import Mode, Spectrum, solve_spectrum, up_to
 from apc.support.state_limits import MATRIX_STATES
@@ -166,7 +172,7 @@ def near_start(numeric: NumericModel) -> tuple[str, ...]:
         return elements
     try:
         all_sides = sides(numeric)
-        groups, _ = lifted_groups(all_sides[0].numeric)
+        groups, _ = lifted_classes(all_sides[0].numeric)
     except ApcError:  # no result with these values
         return (*elements, AT_REST if at_rest else NOT_LINEAR)
     return (
@@ -230,7 +236,7 @@ def analyze(
     ApcError
         E804 a system of too many states for its matrix, E806 an overflow, E850 a method that is not
         applicable; the errors of `one_sided_slopes.sides`, `method_selection.refuse_varying` and
-        `peer_classes.peer_groups`.
+        `peer_classes.classes_of_peers`.
     """
     return analyze_sides(numeric, method=method, certify=certify)[0]
 
@@ -487,7 +493,7 @@ def _solve_populations(numeric: NumericModel) -> tuple[Spectrum, tuple[Note, ...
     return spectrum, () if rigid is not None else (note,)
 
 
-def lifted_groups(
+def lifted_classes(
     numeric: NumericModel,
 ) -> tuple[tuple[PeerClass, ...], CommunicationGraph]:
     """Return the classes of peers with equal dynamics, lifted over a frame, and the communication graph.
@@ -495,7 +501,7 @@ def lifted_groups(
     Raises
     ------
     ApcError
-        As `method_selection.refuse_varying` and `peer_classes.peer_groups`.
+        As `method_selection.refuse_varying` and `peer_classes.classes_of_peers`.
     """
     refuse_varying(numeric.model, numeric.jacobians)
-    return peer_groups(numeric), numeric.exchange
+    return classes_of_peers(numeric), numeric.exchange

@@ -21,7 +21,13 @@ from apc.linearization.jacobians import SubsystemJacobians
 from apc.spectrum.graph_loops import common_graph
 from apc.spectrum.interconnection import ModalSystem
 from apc.spectrum.modes import decompose, dense_loop, refuse_dense
-from apc.spectrum.peer_classes import PeerClass, has_more_states, peer_groups, too_large, used_coupling_terms
+from apc.spectrum.peer_classes import (
+    PeerClass,
+    classes_of_peers,
+    has_more_states,
+    too_large,
+    used_coupling_terms,
+)
 from apc.support.memory import refuse_beyond
 from apc.support.state_limits import MATRIX_STATES
 from apc.timing.communication_graph import CommunicationGraph
@@ -101,7 +107,7 @@ def make_plan(numeric: NumericModel, method: str = "auto") -> AnalysisPlan:
     ------
     ApcError
         E804 a system of too many states for its matrix, E850 a method that is not applicable; and the errors
-        of `refuse_varying` and `peer_classes.peer_groups`.
+        of `refuse_varying` and `peer_classes.classes_of_peers`.
     """
     system, exchange = numeric.model, numeric.exchange
     if method not in METHODS or method == PAPER:
@@ -122,7 +128,7 @@ def make_plan(numeric: NumericModel, method: str = "auto") -> AnalysisPlan:
         if method == "determinant":
             reason = f"the peers differ and are not completely connected over {sparse[0]}"
             raise cannot_serve(system, method, reason)
-    groups = peer_groups(numeric)
+    groups = classes_of_peers(numeric)
     if is_large_ring(groups, exchange):
         message = f"a ring of {exchange.peers:,} peers has as many subsystems; the limit is {LARGEST_RING:,}"
         raise ApcError(

@@ -17,7 +17,7 @@ from typing import Any
 
 import flint
 
-from apc.analysis.analysis import lifted_groups
+from apc.analysis.analysis import lifted_classes
 from apc.compiler.compiled import Model
 from apc.lifting.numeric_model import numeric_model
 from apc.parameter_values.parameters import resolve
@@ -65,7 +65,7 @@ def spectral_truth(system: Model) -> Truth:
     Raises
     ------
     ApcError
-        As `analysis.lifted_groups`.
+        As `analysis.lifted_classes`.
     NotSupportedError
         There is no reference; the text is the reason.
     """
@@ -96,7 +96,7 @@ def _loops(system: Model) -> Sequence[ModalSystem]:
         raise NotSupportedError(f"{moving:,} states of different peers {TOO_LONG}")
     if system.peers > BALL_STATES and any(link.graph.shape not in SPLIT for link in system.links):
         raise NotSupportedError(f"{system.peers:,} peers on a graph {TOO_LONG}")
-    groups, exchange = lifted_groups(numeric_model(system))
+    groups, exchange = lifted_classes(numeric_model(system))
     loops = decompose(groups, exchange).loops
     if any(
         weight_error and coupling_term not in loop.surds

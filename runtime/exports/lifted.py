@@ -31,7 +31,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import lifted_groups, near_start
+from apc.analysis.analysis import lifted_classes, near_start
 from apc.compiler.compiled import Model, PeerType
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation, nearest
 from apc.exports.identifiers import ExportedSignal
@@ -171,7 +171,7 @@ def state_space(system: Model, *, open_at: str = "") -> StateSpace:
     Raises
     ------
     ApcError
-        E950 no such link or coupler; E951 too many states; and those of `analysis.lifted_groups`.
+        E950 no such link or coupler; E951 too many states; and those of `analysis.lifted_classes`.
     """
     groups, exchange = peers_of(numeric_model(system))
     (a, b, c, d), (states, inputs, outputs), unpushed = lifted(system, groups, exchange, open_at, IN_FLOATS)
@@ -185,9 +185,9 @@ def state_space(system: Model, *, open_at: str = "") -> StateSpace:
 
 
 def peers_of(numeric: NumericModel) -> tuple[tuple[PeerClass, ...], CommunicationGraph]:
-    """Return the peers of a system as `analysis.lifted_groups`; too large a system raises ApcError E951."""
+    """Return the peers of a system as `analysis.lifted_classes`; too large a system raises ApcError E951."""
     try:
-        return lifted_groups(numeric)
+        return lifted_classes(numeric)
     except ApcError as error:
         if any(mistake.code != "E804" for mistake in error.mistakes):
             raise
@@ -234,7 +234,7 @@ def lifted(
     system, open_at
         As for `state_space`.
     groups, exchange
-        The peers and the communication graph, from `analysis.lifted_groups`.
+        The peers and the communication graph, from `analysis.lifted_classes`.
     numbers
         The numerical parts of the frame.
     """

@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import Analysis, analyze, lifted_groups, near_start
+from apc.analysis.analysis import Analysis, analyze, lifted_classes, near_start
 from apc.analysis.contact_modes import contact_modes
 from apc.analysis.nonlinear_elements import is_linear
 from apc.analysis.one_sided_slopes import severity, sides
@@ -260,7 +260,7 @@ def _models_by_direction(numeric: NumericModel) -> dict[str, NumericModel]:
     system = without_hands(numeric.model, OPTION)
     numeric = numeric if system is numeric.model else numeric_model(system)
     along = directions_of(system)
-    for loop in split(*lifted_groups(sides(numeric)[0].numeric)) if along else ():
+    for loop in split(*lifted_classes(sides(numeric)[0].numeric)) if along else ():
         parts = load_pool("scipy.sparse.csgraph").connected_components(loop.matrix != 0, connection="weak")[1]
         axes_of_part: dict[str, set[str]] = {}
         for name, part_label in zip(loop.layout.names, parts.tolist(), strict=True):

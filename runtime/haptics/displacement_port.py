@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import lifted_groups
+from apc.analysis.analysis import lifted_classes
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.lifting.devices import Device, coupled_directly, find_device, no_device
 from apc.lifting.frame_inputs import FrameInputs, with_holds, with_ports
@@ -121,7 +121,7 @@ def port_loops(numeric: NumericModel, *, option: str) -> tuple[PortLoop, ...]:
         The reason why no device is ever passive.
     """
     system = numeric.model
-    groups, exchange = lifted_groups(numeric)
+    groups, exchange = lifted_classes(numeric)
     location, unit_of = (
         SourceLocation(system.origin.topology),
         {parameter.name: parameter.unit for parameter in system.parameters},

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import lifted_groups
+from apc.analysis.analysis import lifted_classes
 from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.language.vectors import whole_and_index
@@ -69,7 +69,7 @@ def responses(numeric: NumericModel, port: DevicePort, other: DevicePort) -> Res
         E931 a peer without a device; E933 a model too large.
     """
     system = numeric.model
-    groups, exchange = lifted_groups(numeric)
+    groups, exchange = lifted_classes(numeric)
     unit_of = {parameter.name: parameter.unit for parameter in system.parameters}
     direct = coupled_directly(system.peer_types)
     driven_classes, subsystems, gripped = [], {}, {}

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import lifted_groups
+from apc.analysis.analysis import lifted_classes
 from apc.compiler.compiled import Clock, Model, PeerType
 from apc.lifting.interval_arithmetic import error_radius, value_of
 from apc.lifting.lift import FrameMap
@@ -118,7 +118,7 @@ def build_reception(
     shifted_system = replace(
         system, timings=tuple(replace(timing, value=timings[timing.name]) for timing in system.timings)
     )
-    groups, exchange = lifted_groups(replace(numeric, model=shifted_system, given_schedules=by_tick))
+    groups, exchange = lifted_classes(replace(numeric, model=shifted_system, given_schedules=by_tick))
     rows = {group.index: schedules[exchange.group_of(group.peers.first)].selected for group in groups}
     strictly = numeric.order.index("tick") < numeric.order.index("deliver")
     frame, quantum = schedules[0].frame_s, schedules[0].quantum

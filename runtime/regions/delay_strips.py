@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import lifted_groups
+from apc.analysis.analysis import lifted_classes
 from apc.lifting.numeric_model import NumericModel
 from apc.parameter_values.parameter_names import ParameterRef, Range, parameter_of
 from apc.regions.adaptive_grid import HALVINGS
@@ -279,7 +279,7 @@ def _family_of_strip(
 ) -> DirectFamily | None:
     """Return the matrices over a strip, step durations linear in the delay; None if rigid modes change."""
     assert segment.evaluator is not None, "something depends on the delay"
-    groups, exchange = lifted_groups(numeric.at(generic(segment.inside, parameter_refs[1:])))
+    groups, exchange = lifted_classes(numeric.at(generic(segment.inside, parameter_refs[1:])))
     family = batch_evaluator(
         segment.inside, parameter_refs, groups, exchange, durations=segment.evaluator.durations
     )

@@ -266,7 +266,7 @@ def region(
     ------
     ApcError
         E896 a parameter of an unreliable link; E905 the model cannot be analyzed everywhere in the rectangle,
-        or rounding prevents locating the boundary; and the errors of `analysis.lifted_groups`.
+        or rounding prevents locating the boundary; and the errors of `analysis.lifted_classes`.
 
     Notes
     -----

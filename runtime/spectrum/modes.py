@@ -59,7 +59,7 @@ def split(groups: Sequence[PeerClass], exchange: CommunicationGraph) -> tuple[Cl
     Parameters
     ----------
     groups
-        All peers (see `peer_classes.peer_groups`).
+        All peers (see `peer_classes.classes_of_peers`).
     exchange
         The links.
 
@@ -181,7 +181,7 @@ def complete_loops(groups: Sequence[PeerClass], exchange: CommunicationGraph) ->
     Parameters
     ----------
     groups
-        All peers (see `peer_classes.peer_groups`).
+        All peers (see `peer_classes.classes_of_peers`).
     exchange
         The links, all of them complete.
     """
@@ -211,7 +211,7 @@ def dense(groups: Sequence[PeerClass], exchange: CommunicationGraph) -> ClosedLo
     Parameters
     ----------
     groups
-        All peers (see `peer_classes.peer_groups`).
+        All peers (see `peer_classes.classes_of_peers`).
     exchange
         The links.
 

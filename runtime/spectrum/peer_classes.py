@@ -1,8 +1,8 @@
 """Classes of peers with equal motion: one subsystem each, linearized and lifted once.
 
 Takes: a `NumericModel`.
-Gives: `PeerClass`, `peer_groups`, `representatives`, `has_more_states`; `used_coupling_terms`, `states_of`;
-`too_large`; `group_name`, `start_classes`.
+Gives: `PeerClass`, `classes_of_peers`, `representatives`, `has_more_states`; `used_coupling_terms`,
+`states_of`; `too_large`; `group_name`, `start_classes`.
 Guarantees: there is one class for each distinct dynamics, found in a time proportional to the number of
 peers; consecutive peers take no memory. A subsystem that is not affine is linearized at its own start values,
 with receptions from the others at theirs. The matrices of a class exist in exact rationals as well, if its
@@ -132,7 +132,7 @@ class PeerClass:
         )
 
 
-def build_group(
+def build_class(
     numeric: NumericModel,
     index: int,
     peers: PeerIndices,
@@ -256,7 +256,7 @@ MOST_DIFFERENT = 400
 
 
 @cached_in_model
-def peer_groups(numeric: NumericModel) -> tuple[PeerClass, ...]:
+def classes_of_peers(numeric: NumericModel) -> tuple[PeerClass, ...]:
     """Return the classes of equal peers of a model, each linearized once.
 
     Raises
@@ -267,7 +267,7 @@ def peer_groups(numeric: NumericModel) -> tuple[PeerClass, ...]:
         E808 a value that is not finite.
     """
     try:
-        return _peer_groups(numeric)
+        return _classes_of_peers(numeric)
     except ApcError as error:
         origin = numeric.model.origin
         raise ApcError(
@@ -275,7 +275,7 @@ def peer_groups(numeric: NumericModel) -> tuple[PeerClass, ...]:
         ) from None
 
 
-def _peer_groups(numeric: NumericModel) -> tuple[PeerClass, ...]:
+def _classes_of_peers(numeric: NumericModel) -> tuple[PeerClass, ...]:
     """Return peers in classes of equal matrices; if the start affects the matrices, also of equal start."""
     exchange = numeric.exchange
     by_matrices = all(subsystem.parameters_suffice for subsystem in numeric.subsystems)
@@ -289,7 +289,7 @@ def _peer_groups(numeric: NumericModel) -> tuple[PeerClass, ...]:
         received = [*receptions]
     check_size([numeric.subsystems[exchange.group_of(peers.first)] for peers in classes], exchange)
     return tuple(
-        build_group(numeric, index, peers, *received[index])
+        build_class(numeric, index, peers, *received[index])
         for index, peers in zip(indices, classes, strict=True)
     )
 
@@ -399,6 +399,6 @@ def representatives(numeric: NumericModel) -> tuple[PeerClass, ...]:
     """Return a class for each group of the model, with the parameters of its first peer, not lifted."""
     runs = itertools.pairwise(numeric.exchange.starts.tolist())
     return tuple(
-        build_group(numeric, index, PeerIndices((range(*run),)), lifted=False)
+        build_class(numeric, index, PeerIndices((range(*run),)), lifted=False)
         for index, run in enumerate(runs)
     )

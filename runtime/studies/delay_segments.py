@@ -20,7 +20,7 @@ from functools import lru_cache, partial
 
 import numpy as np
 
-from apc.analysis.analysis import lifted_groups
+from apc.analysis.analysis import lifted_classes
 from apc.compiler.compiled import Model, PeerType
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.multiples import common_divisor
@@ -296,7 +296,7 @@ def _segment(
             durations[quanta] = (float(quanta * schedule.quantum - slope * delay), float(slope))
     if not follows and not any(slope for _, slope in durations.values()):
         return DelaySegment(low, high, None, inside.model)
-    groups, exchange = lifted_groups(inside)
+    groups, exchange = lifted_classes(inside)
     evaluator = batch_evaluator(
         inside.model, (parameter_ref,), groups, exchange, durations=durations, follows=follows
     )

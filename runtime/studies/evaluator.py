@@ -19,7 +19,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import lifted_groups
+from apc.analysis.analysis import lifted_classes
 from apc.analysis.one_sided_slopes import sides
 from apc.compiler.compiled import Group, Model, Parameter, group_count
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
@@ -178,7 +178,7 @@ def evaluator(numeric: NumericModel, parameter_refs: Sequence[ParameterRef]) -> 
     Raises
     ------
     ApcError
-        As for `analysis.lifted_groups`.
+        As for `analysis.lifted_classes`.
     """
     return _evaluator(numeric, tuple(parameter_refs))
 
@@ -193,7 +193,7 @@ def _lifted_anywhere(
     numeric: NumericModel, free: Sequence[ParameterRef]
 ) -> tuple[tuple[PeerClass, ...], CommunicationGraph]:
     """Return the classes of peers that are equal at every value of the parameters, lifted, and the graph."""
-    return lifted_groups(numeric.at(generic(numeric.model, free)))
+    return lifted_classes(numeric.at(generic(numeric.model, free)))
 
 
 def parameters_suffice(numeric: NumericModel) -> bool:
@@ -207,13 +207,13 @@ def closed_at(
     """Return the closed systems at one point (m,) with error bounds, as in an analysis."""
     changed = apply(numeric.model, overrides_at(numeric.model, parameter_refs, value))
     return tuple(
-        closed for side in sides(numeric.at(changed)) for closed in split(*lifted_groups(side.numeric))
+        closed for side in sides(numeric.at(changed)) for closed in split(*lifted_classes(side.numeric))
     )
 
 
 def _relative_matrices(numeric: NumericModel) -> list[Floats]:
     """Return the matrices of a model's closed systems in relative coordinates; NaN if undefined."""
-    systems = split(*lifted_groups(numeric))
+    systems = split(*lifted_classes(numeric))
     return [reduced(loop_structure(closed), closed.matrix[None], 1)[0] for closed in systems]
 
 

@@ -359,7 +359,7 @@ def batch_evaluator(
     parameter_refs
         The parameters that vary.
     groups, exchange
-        The model's peers at a generic point, from `analysis.lifted_groups`.
+        The model's peers at a generic point, from `analysis.lifted_classes`.
     durations
         For a time that varies: the seconds of each step by its quanta, as constant and slope.
     follows

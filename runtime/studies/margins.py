@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import Analysis, analyze, lifted_groups
+from apc.analysis.analysis import Analysis, analyze, lifted_classes
 from apc.analysis.one_sided_slopes import sides
 from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError, SourceLocation
@@ -190,7 +190,7 @@ def _loop_sizes(numeric: NumericModel, *, most: float) -> list[int]:
     # A bound by the states of one peer, without building loops.
     if events + max(map(states_of, schedules, numeric.subsystems)) ** 2 > most:
         return []
-    states = [loop.states for loop in decompose(*lifted_groups(numeric)).loops]
+    states = [loop.states for loop in decompose(*lifted_classes(numeric)).loops]
     return states if events + sum(state**2 for state in states) <= most else []
 
 

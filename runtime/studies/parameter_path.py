@@ -18,7 +18,7 @@ from functools import cached_property, partial
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import Analysis, analyze, lifted_groups
+from apc.analysis.analysis import Analysis, analyze, lifted_classes
 from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError, SourceLocation
 from apc.lifting.numeric_model import NumericModel
@@ -333,7 +333,7 @@ class DelayPath(AnalyzedPath):
         The rigid modes are left out: the same number of eigenvalues nearest to 1.
         """
         try:
-            systems = split(*lifted_groups(self.numeric.at(inside_model)))
+            systems = split(*lifted_classes(self.numeric.at(inside_model)))
         except ApcError:  # an analysis avoids a matrix that is too large
             return 1.0
         if len(systems) not in self.rigid:

@@ -14,7 +14,7 @@ import pytest
 from hypothesis import HealthCheck, Phase, example, given, settings
 from hypothesis import strategies as st
 
-from apc.analysis.analysis import analyze, lifted_groups
+from apc.analysis.analysis import analyze, lifted_classes
 from apc.compiler.errors import ApcError
 from apc.lifting.numeric_model import numeric_model
 from apc.spectrum.modes import dense, split
@@ -76,7 +76,7 @@ def at(comp: float, comm: float, phase: float = 0, first: float = 0, own: bool =
 
 def check(topology: TopologySource) -> None:
     """Compare the split and the dense spectrum of a topology's text with that of peers stepped one by one."""
-    groups, exchange = lifted_groups(numeric_model(compiled(text_of(topology))))
+    groups, exchange = lifted_classes(numeric_model(compiled(text_of(topology))))
     systems = split(groups, exchange)
     modes = np.concatenate([np.repeat(np.linalg.eigvals(one.matrix), one.multiplicity) for one in systems])
     whole = np.linalg.eigvals(dense(groups, exchange).matrix)
@@ -160,7 +160,7 @@ def test_what_is_remembered_and_held_is_a_state_where_it_is_read(
     ticks: list[str], delay: str, names: list[str], expected: list[list[float]]
 ) -> None:
     variables = ", f: {unit: 1, start: 0}" + (", s: {unit: 1, start: 0}" if len(ticks) > 1 else "")
-    [group], _ = lifted_groups(
+    [group], _ = lifted_classes(
         numeric_model(alone("hold(f, delay) - x", *ticks, variables=variables, delay=delay))
     )
     assert list(group.z_names) == names

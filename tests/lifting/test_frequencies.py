@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import apc
-from apc.analysis.analysis import analyze, lifted_groups
+from apc.analysis.analysis import analyze, lifted_classes
 from apc.lifting.numeric_model import numeric_model
 from apc.spectrum.modes import split
 from apc.spectrum.spectrum import angles_in_frame
@@ -90,7 +90,7 @@ def test_a_certified_real_negative_eigenvalue_keeps_its_frequency_and_damping(na
 
 
 def test_what_a_mode_turns_hangs_on_no_phase_of_its_vector() -> None:
-    for system in split(*lifted_groups(numeric_model(apc.compile(TOPOLOGIES / "two-users-reported.yaml")))):
+    for system in split(*lifted_classes(numeric_model(apc.compile(TOPOLOGIES / "two-users-reported.yaml")))):
         values, vectors = np.linalg.eig(system.matrix.astype(complex))
         values.imag[np.abs(values.imag) < 1e-12] = 0.0
         shares = np.abs(vectors * np.linalg.pinv(vectors).T)

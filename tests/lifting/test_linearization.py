@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from apc.analysis.analysis import analyze, lifted_groups
+from apc.analysis.analysis import analyze, lifted_classes
 from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError
 from apc.lifting.numeric_model import numeric_model
@@ -38,13 +38,13 @@ def test_an_edge_function_is_linearized_pair_by_pair(operator: str, graph: str, 
     topology = TopologySource(operator, 4, weights=arcs, pairs=_cubic_pairs(starts, 2e5), **GAINS)
     expected = np.linalg.eigvals(np.array(frame_matrix(topology)))
     assert apart(_split(system), expected) < 1e-11
-    whole = np.linalg.eigvals(dense(*lifted_groups(numeric_model(system))).matrix)
+    whole = np.linalg.eigvals(dense(*lifted_classes(numeric_model(system))).matrix)
     assert apart(whole, expected) < 1e-11
 
 
 def _split(system: Model) -> np.ndarray:
     """Return all eigenvalues of the split system, each as often as it counts."""
-    systems = split(*lifted_groups(numeric_model(system)))
+    systems = split(*lifted_classes(numeric_model(system)))
     return np.concatenate([np.repeat(np.linalg.eigvals(one.matrix), one.multiplicity) for one in systems])
 
 

@@ -33,7 +33,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import lifted_groups
+from apc.analysis.analysis import lifted_classes
 from apc.analysis.one_sided_slopes import sides
 from apc.compiler.compiled import Model, group_count
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
@@ -234,7 +234,7 @@ def _matrices(
         changed = numeric.at(apply(numeric.model, [Override(parameter_ref, Fraction(count))]))
         if sides(changed)[0].numeric is not changed:
             raise _not_interchangeable(f"with {count} peers the start is at a kink")
-        groups, exchange = lifted_groups(changed)
+        groups, exchange = lifted_classes(changed)
         complete = all(map(exchange.is_complete, exchange.links))
         if not complete or decompose(groups, exchange).method != "modes":
             raise _not_interchangeable("the peers are not interchangeable")

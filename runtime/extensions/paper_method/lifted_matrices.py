@@ -37,7 +37,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.analysis.analysis import Analysis, lifted_groups
+from apc.analysis.analysis import Analysis, lifted_classes
 from apc.analysis.methods import PAPER
 from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
@@ -134,7 +134,7 @@ def paper_method(system: Model) -> PaperMethod:
         large; and the errors of an analysis.
     """
     with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
-        return _named_matrices(_open_loop(system, dense(*lifted_groups(numeric_model(system)))))
+        return _named_matrices(_open_loop(system, dense(*lifted_classes(numeric_model(system)))))
 
 
 def analyze_paper(system: Model) -> Analysis:
@@ -154,7 +154,7 @@ def analyze_paper(system: Model) -> Analysis:
         As for `paper_method`; E861 also for a model with a drift.
     """
     with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
-        closed_loop = dense(*lifted_groups(numeric_model(system)))
+        closed_loop = dense(*lifted_classes(numeric_model(system)))
         loop = _open_loop(system, closed_loop)
         rigid = find_rigid_modes(closed_loop)
         if rigid.drifts:

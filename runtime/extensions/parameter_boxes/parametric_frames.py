@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
 
-from apc.analysis.analysis import lifted_groups
+from apc.analysis.analysis import lifted_classes
 from apc.compiler.compiled import Formula, Group, Model
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.expression_data import RULES
@@ -61,7 +61,7 @@ def parametric_models(
         )
     for interval in ranges:
         refuse_channel_number(numeric.model, interval.free, LOCATION)
-    subsystems = parametric_subsystems(numeric, ranges, lambda changed: lifted_groups(numeric.at(changed)))
+    subsystems = parametric_subsystems(numeric, ranges, lambda changed: lifted_classes(numeric.at(changed)))
     subsystem_of_class = {group.index: subsystems.subsystems[group.name] for group in subsystems.groups}
     return [
         (closed_system, tuple(subsystem_of_class[group.index] for group in closed_system.subsystems))

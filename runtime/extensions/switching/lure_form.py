@@ -44,7 +44,7 @@ from apc.linearization.branch_conditions import find_switches
 from apc.linearization.linear_subsystem import LinearSubsystem
 from apc.spectrum.interconnection import ModalSystem, close_loop, interconnect_with_inputs, lay_out
 from apc.spectrum.modes import orthogonal_loops
-from apc.spectrum.peer_classes import PeerClass, peer_groups
+from apc.spectrum.peer_classes import PeerClass, classes_of_peers
 from apc.spectrum.relative_coordinates import relative_coordinates, relative_rows, with_uncertainty
 from apc.spectrum.rigid_modes import find_rigid_modes
 from apc.support.not_supported import NotSupportedError
@@ -138,7 +138,7 @@ def contact_groups(numeric: NumericModel) -> list[tuple[PeerClass, tuple[SectorN
         if not on[group.peer_type].parameters_suffice:
             raise NotSupportedError(f"a force at {group.name} is nonlinear or depends on individual senders")
     pairs = []
-    for peers in peer_groups(numeric.with_jacobians(on)):
+    for peers in classes_of_peers(numeric.with_jacobians(on)):
         type_index = system.groups[numeric.exchange.group_of(peers.peers.first)].peer_type
         forces = (
             contact_force(switched[type_index], part, numeric.jacobians[type_index], peers.parameters)
