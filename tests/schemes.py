@@ -34,14 +34,15 @@ class ByHand:
     """A scheme: force ticks every millisecond, packets every `ratio` of them, `late` and `comp` in ticks.
 
     `bodies` are by peer (mass, damping, springs to the ground). A packet holds the sampled (x, v) of `many`
-    bodies from `told` on, and what the law put out at the tick before. `receives` are by peer those it hears.
+    bodies from `first_sent` on, and what the law put out at the tick before. `receives` are by peer those it
+    hears.
     Where a packet is missing and `zero` is set, a peer hears its own motion in its place.
     """
 
     bodies: Sequence[Sequence[tuple[float, float, float]]]
     receives: Sequence[Sequence[int]]
     law: Law
-    told: int
+    first_sent: int
     many: int = 1
     memory: int = 0
     out: int = 0
@@ -53,7 +54,7 @@ class ByHand:
 
     def sampled(self, motion: Sequence[tuple[Any, Any]]) -> list[Any]:
         """Return what is sent of a peer's motion."""
-        return [value for body in motion[self.told : self.told + self.many] for value in body]
+        return [value for body in motion[self.first_sent : self.first_sent + self.many] for value in body]
 
     @property
     def stored(self) -> int:
@@ -193,7 +194,7 @@ def experiment(operator: str, ticks: int) -> NDArray[np.float64]:
         return [pushes[i] - f_c, f_c - f_t], [f_c, f_t], []
 
     bodies = [[(0.1, 5.0, 0.0)] * 2] * 3
-    scheme = ByHand(bodies, everybody(3), law, told=1, memory=2, comp=0)
+    scheme = ByHand(bodies, everybody(3), law, first_sent=1, memory=2, comp=0)
     starts = [[(-math.copysign(0.03, push), 0.0), (0.0, 0.0)] for push in pushes]
     rows = itertools.islice(course(scheme, starts, [[0.0, 0.0]] * 3), ticks)
     return np.array(

@@ -76,14 +76,14 @@ def _many(name: str) -> MethodResult:
 def _sweep(name: str) -> MethodResult:
     parameter, value, unit = _number(name)
     found = apc.sweep(model(name), {parameter: [f"{value!r} {unit}"]}, jobs=1)
-    told = {heading: found.column(heading)[0] for heading in found.headings}
-    if told["message"]:
-        raise RuntimeError(told["message"])
-    verdict = str(told["verdict"])
+    reported = {heading: found.column(heading)[0] for heading in found.headings}
+    if reported["message"]:
+        raise RuntimeError(reported["message"])
+    verdict = str(reported["verdict"])
     return MethodResult(
-        float(told["spectral_radius"]),
-        float(told["spectral_radius_error"]),
-        int(told["rigid_modes"]),
+        float(reported["spectral_radius"]),
+        float(reported["spectral_radius_error"]),
+        int(reported["rigid_modes"]),
         None if verdict.startswith("undecided") else verdict.startswith("stable"),
         verdict,
     )
@@ -178,7 +178,7 @@ def _pairs() -> list[object]:
 @pytest.mark.few(70)
 @pytest.mark.parametrize(("name", "method"), _pairs())
 def test_every_method_is_right_within_its_bound_or_refuses(name: str, method: str) -> None:
-    case, told = CASES[name], truth(name)
+    case, reported = CASES[name], truth(name)
     try:
         printed = METHODS[method](name)
     except ApcError as error:
@@ -186,16 +186,16 @@ def test_every_method_is_right_within_its_bound_or_refuses(name: str, method: st
         return
     wide = WIDE.get(method, {}).get(case.name, USEFUL)
     error = wide * max(1.0, printed.radius) if method == "export" else printed.error
-    assert distance(printed.radius, told) <= error
+    assert distance(printed.radius, reported) <= error
     assert error <= wide * max(1.0, printed.radius)
-    assert printed.rigid is None or printed.rigid == told.rigid
-    if method == "export" or (method == "box" and abs(told.radius - 1) < 1e-8):
+    assert printed.rigid is None or printed.rigid == reported.rigid
+    if method == "export" or (method == "box" and abs(reported.radius - 1) < 1e-8):
         return
     if printed.stable is None:
-        assert case.name in OPEN.get(method, ()) or abs(told.radius - 1) < 1e-30
+        assert case.name in OPEN.get(method, ()) or abs(reported.radius - 1) < 1e-30
     else:
-        assert printed.stable == (told.radius < 1 and told.verdict != "drifts")
-        assert not (printed.verdict and told.verdict) or printed.verdict == told.verdict
+        assert printed.stable == (reported.radius < 1 and reported.verdict != "drifts")
+        assert not (printed.verdict and reported.verdict) or printed.verdict == reported.verdict
 
 
 def test_every_topology_of_the_library_is_followed_or_says_why_not() -> None:

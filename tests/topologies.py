@@ -100,7 +100,7 @@ def library(folder: Path, *texts: str) -> Library:
     return Library((folder,))
 
 
-def told(function: Callable[..., object], *arguments: object) -> list[str]:
+def messages_of(function: Callable[..., object], *arguments: object) -> list[str]:
     """Return the first line of every mistake that a call raises: place, code and sentence."""
     try:
         function(*arguments)

@@ -69,11 +69,13 @@ class Case:
 
 
 def _stored(path: Path) -> Case:
-    told = STORED[path.stem]
+    reported = STORED[path.stem]
 
     def tell() -> Truth:
         with precision(256):
-            return Truth(flint.arb(told["spectral_radius"]), told["rigid_modes"], 1e-45, told["verdict"])
+            return Truth(
+                flint.arb(reported["spectral_radius"]), reported["rigid_modes"], 1e-45, reported["verdict"]
+            )
 
     return Case(path.stem, "hard", lambda: apc.compile(path), tell)
 
@@ -307,9 +309,9 @@ def truth(name: str) -> Truth:
     return CASES[name].tell()
 
 
-def distance(value: float, told: Truth) -> float:
+def distance(value: float, reported: Truth) -> float:
     """Return how far a radius is from the truth at least."""
     if not math.isfinite(value):
         return math.inf
     with precision(256):
-        return max(0.0, abs(float((flint.arb(value) - told.radius).mid())) - told.error)
+        return max(0.0, abs(float((flint.arb(value) - reported.radius).mid())) - reported.error)

@@ -53,8 +53,8 @@ def run(title: str, words: str) -> tuple[str, list[str], int]:
     shown = words if words.startswith("apc") else f"python -m {words}"
     lines = ran.stdout.splitlines()
     rows = [f"{line} {title} |" for line in lines if line.startswith(ROW) and line != HEAD]
-    told = "\n".join(line for line in lines if not line.startswith(ROW)).replace("\n\n\n", "\n\n")
-    text = "\n\n".join(printed for printed in (told.rstrip(), ran.stderr.rstrip()) if printed)
+    reported = "\n".join(line for line in lines if not line.startswith(ROW)).replace("\n\n\n", "\n\n")
+    text = "\n\n".join(printed for printed in (reported.rstrip(), ran.stderr.rstrip()) if printed)
     end = f"\n\nIt ended with code {ran.returncode}." if ran.returncode else ""
     how = f"{datetime.now(tz=UTC).date()}, {used:.0f} s, load {load:.0f}"
     picture = words.partition("--out tests/bench/")[2].partition(" ")[0]

@@ -36,7 +36,7 @@ class Timed:
     bound: float | None = None
     remark: str = ""
 
-    def told(self, unit: str) -> str:
+    def report_of(self, unit: str) -> str:
         """Return the error in words."""
         if self.error is None:
             return self.remark or "–"

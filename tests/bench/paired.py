@@ -127,20 +127,20 @@ def serve() -> None:
     models: dict[str, Any] = {}
     for line in sys.stdin:
         file, question, runs, *more = json.loads(line)
-        told: dict[str, Any] = {"refused": "", "words": "", "numbers": [], "seconds": []}
+        reported: dict[str, Any] = {"refused": "", "words": "", "numbers": [], "seconds": []}
         signal.alarm(LONGEST_S)
         try:
             models[file] = models.get(file) or apc.compile(file)
             for _ in range(runs):
                 begun = time.process_time()
-                told["words"], told["numbers"] = QUESTIONS[question](models[file], *more)
-                told["seconds"].append(time.process_time() - begun)
+                reported["words"], reported["numbers"] = QUESTIONS[question](models[file], *more)
+                reported["seconds"].append(time.process_time() - begun)
         except TooLong:
-            told["refused"] = f"took more than {LONGEST_S} s"
+            reported["refused"] = f"took more than {LONGEST_S} s"
         except Exception as error:
-            told["refused"] = f"{type(error).__name__}: {str(error)[:120].splitlines()[0]}"
+            reported["refused"] = f"{type(error).__name__}: {str(error)[:120].splitlines()[0]}"
         signal.alarm(0)
-        print(json.dumps(told), flush=True)
+        print(json.dumps(reported), flush=True)
 
 
 def started(python: str) -> subprocess.Popen[str]:
@@ -217,14 +217,14 @@ def bracketed(version: subprocess.Popen[str], files: Sequence[Path]) -> bool:
             for criterion in criteria
         ]
         for name, criterion in requested:
-            told = answered(version, str(file), BRACKETED, 1, name, criterion)
-            wrong, numbers = told["words"], told["numbers"]
-            if told["refused"].startswith("took"):
+            reported = answered(version, str(file), BRACKETED, 1, name, criterion)
+            wrong, numbers = reported["words"], reported["numbers"]
+            if reported["refused"].startswith("took"):
                 refused["took too long"] += 1
-            elif told["refused"].startswith("ApcError"):
+            elif reported["refused"].startswith("ApcError"):
                 refused["refused"] += 1
-            elif told["refused"]:
-                wrong = f"{name} {criterion}: {told['refused']}"
+            elif reported["refused"]:
+                wrong = f"{name} {criterion}: {reported['refused']}"
             held += len(numbers)
             widest = max([widest, *(error / abs(value) for value, error in numbers if value)])
             good = good and not wrong

@@ -117,8 +117,8 @@ def relative_error(printed: str, fields: tuple[str, ...]) -> str:
     """Return the error that a command prints, relative to its value; empty without fields."""
     if not fields:
         return ""
-    told = json.loads(printed)
-    error, value = (float(told[name]) for name in fields)
+    reported = json.loads(printed)
+    error, value = (float(reported[name]) for name in fields)
     return f"{error / abs(value):.0e}"
 
 

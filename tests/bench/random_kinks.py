@@ -121,11 +121,11 @@ def main() -> int:
     wrong = refused = 0
     for _ in range(options.count):
         with tempfile.TemporaryDirectory() as folder:
-            told = compare(rng, Path(folder))
-        refused += told == "refused"
-        if told not in ("", "refused"):
+            reported = compare(rng, Path(folder))
+        refused += reported == "refused"
+        if reported not in ("", "refused"):
             wrong += 1
-            print(told)
+            print(reported)
     print(f"{options.count} topologies: {wrong} wrong, {refused} refused (E808)")
     return int(wrong > 0)
 

@@ -111,8 +111,8 @@ def _looked_into(system: Model, found: Analysis) -> list[str]:
     if found.stable is None and found.spectral_radius == 1:
         return []  # a motion that grows with t² leaves an eigenvalue 1, which the reference takes for a translation
     try:
-        told = sensitivities_of(numeric_model(system), found)
-        return [check_sensitivities(system, told), check_frequencies(found)]
+        reported = sensitivities_of(numeric_model(system), found)
+        return [check_sensitivities(system, reported), check_frequencies(found)]
     except Exception as error:  # whatever it is, it is a bug
         return [repr(error)]
 

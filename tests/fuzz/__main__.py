@@ -66,7 +66,7 @@ def _run(what: str, options: argparse.Namespace) -> bool:
     for place, failure in enumerate(sorted(failures, key=lambda one: -often[one.key]), start=1):
         folder = options.out / f"{what}-{place:02d}"
         came = f"seed {options.seed}, number {failure.index}, {often[failure.key]} times"
-        text = f"{failure.key}\n{came}\n\n{failure.told}\n"
+        text = f"{failure.key}\n{came}\n\n{failure.reported}\n"
         for name, data in (*failure.given.files, ("told.txt", text.encode())):
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             (folder / name).write_bytes(data)

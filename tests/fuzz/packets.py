@@ -46,10 +46,10 @@ def run_packets(system: Model, count: int, seed: int) -> tuple[list[str], Counte
             for index in range(given is _playing, count, 2):
                 noise = random.Random(f"{seed}/{index}")
                 sort = noise.choice(list(FORGED))
-                told = given(here, FORGED[sort](noise, here, earlier), sort in INSIDE)
+                reported = given(here, FORGED[sort](noise, here, earlier), sort in INSIDE)
                 outcomes[sort] += 1
-                if told:
-                    failures.append(f"{sort}, seed {seed}, datagram {index}: {told}")
+                if reported:
+                    failures.append(f"{sort}, seed {seed}, datagram {index}: {reported}")
     return failures, outcomes
 
 
@@ -102,17 +102,17 @@ def _playing(here: _Topology, forged: Forgery, may: bool) -> str:
 
 def _meeting(here: _Topology, forged: Forgery, may: bool) -> str:
     """Return what is wrong as a peer meets the others and is given a datagram first."""
-    loop, told = here.loop, ""
+    loop, reported = here.loop, ""
     loop.begins, loop.session, loop.began = 0, 0, None
     loop.offsets.clear()
     here.wire.coming.clear()
     here.wire.send(*forged)
     try:
         loop.meet(60)
-        told = "" if may or loop.session == loop.post.nonce else "it was told when the topology begins"
+        reported = "" if may or loop.session == loop.post.nonce else "it was told when the topology begins"
     except Exception as error:
-        told = f"{type(error).__name__}: {error}"
-    return told or _playing(here, (here.others[0].post.hello(1, 0), here.others[0].address), True)
+        reported = f"{type(error).__name__}: {error}"
+    return reported or _playing(here, (here.others[0].post.hello(1, 0), here.others[0].address), True)
 
 
 def _torn(noise: random.Random, here: _Topology, _: _Topology) -> Forgery:
@@ -146,8 +146,8 @@ def _guessed(noise: random.Random, here: _Topology, _: _Topology) -> Forgery:
     post.keys = {0: noise.choice([post.secret, SECRET, noise.randbytes(32)])}
     requested = Hello(0, here.wire.time, here.loop.post.nonce, 0)
     data = post.data(1, 0, 0, noise.randrange(99), (1.0, 1.0))
-    told = [post.hello(1, 0), post.answer(1, requested, 2, 3, 4), data]
-    return noise.choice(told) or b"", other.address
+    reported = [post.hello(1, 0), post.answer(1, requested, 2, 3, 4), data]
+    return noise.choice(reported) or b"", other.address
 
 
 def _wrong(noise: random.Random, here: _Topology, _: _Topology) -> Forgery:

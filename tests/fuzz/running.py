@@ -65,7 +65,7 @@ class Failure:
     """What went wrong: `key` is the same for failures of one cause, as far as can be told."""
 
     key: str
-    told: str
+    reported: str
     index: int
     given: Input
 
@@ -105,18 +105,18 @@ def run_all(
         def work(tell: Callable[[int, str, str], None], first: int = following, stop: int = stop) -> None:
             for index in range(first, stop):
                 given = kind.make(f"{seed}/{index}")
-                key, told = kind.judge(given)
-                tell(index, key, told or given.sort)
+                key, reported = kind.judge(given)
+                tell(index, key, reported or given.sort)
 
-        for index, key, told in _watched(work, following, stop, kind.memory):
+        for index, key, reported in _watched(work, following, stop, kind.memory):
             following = index + 1
             if key in FINE:
-                outcomes[f"{told}: {key}"] += 1
+                outcomes[f"{reported}: {key}"] += 1
             else:
                 given = kind.make(f"{seed}/{index}")
                 outcomes[f"{given.sort}: FAILED"] += 1
                 often[key] += 1
-                failures.setdefault(key, Failure(key, told, index, given))
+                failures.setdefault(key, Failure(key, reported, index, given))
             if time.monotonic() - shown > 10:
                 shown = time.monotonic()
                 progress(f"{following} inputs, {len(failures)} different failures")
@@ -175,8 +175,8 @@ def _watched(
     following = start
     try:
         while following < stop and received.poll(PATIENCE):
-            index, key, told = received.recv()
-            yield index, key, told
+            index, key, reported = received.recv()
+            yield index, key, reported
             following = index + 1
         silent = following < stop
     except EOFError:
@@ -199,7 +199,7 @@ def _become_worker(
     os.dup2(null, 1)
     os.dup2(null, 2)
     sys.addaudithook(_listen)
-    work(lambda index, key, told: pipe.send((index, key, told)))
+    work(lambda index, key, reported: pipe.send((index, key, reported)))
 
 
 _foreign: list[str] = []
@@ -308,19 +308,19 @@ def _key_of(error: BaseException) -> str:
 
 def _fault_of(error: ApcError, files: dict[str, bytes]) -> tuple[str, str] | None:
     """Return what is wrong with the mistakes of an error."""
-    told = str(error)[:3000]
+    reported = str(error)[:3000]
     mistakes = error.mistakes
     if len({str(one) for one in mistakes}) < len(mistakes):
-        return f"told twice: {mistakes[0].code}", told
+        return f"told twice: {mistakes[0].code}", reported
     texts = {name: re.split(rb"\r\n|\n|\r", data) for name, data in files.items()}
     for mistake in mistakes:
         fault = _fault_in(mistake, texts)
         if fault:
-            return f"{fault}: {mistake.code} {_shape(mistake.sentence)}", told
+            return f"{fault}: {mistake.code} {_shape(mistake.sentence)}", reported
     for name in {one.location.file for one in mistakes}:
         places = [(one.location.line, one.location.column) for one in mistakes if one.location.file == name]
         if places != sorted(places):
-            return f"not in the file's order: {mistakes[0].code}", told
+            return f"not in the file's order: {mistakes[0].code}", reported
     return None
 
 

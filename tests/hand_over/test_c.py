@@ -115,12 +115,12 @@ def test_nothing_in_it_changes_but_what_is_given(tmp_path: Path) -> None:
     code = peer_of(plan, 1, DEFAULT, device=None)
     build(code, tmp_path, ("-O2",))
     subprocess.run([compiler(), "-std=c99", "-c", f"{code.identifier}.c"], cwd=tmp_path, check=True)
-    told = subprocess.run(
+    reported = subprocess.run(
         ["nm", f"{code.identifier}.o"], cwd=tmp_path, capture_output=True, text=True, check=True
     )
-    peer_types = {line.split()[-2]: line.split()[-1] for line in told.stdout.splitlines()}
-    assert not set(peer_types) & set("dDbBCgGsS"), told.stdout
-    called = {line.split()[-1] for line in told.stdout.splitlines() if line.split()[-2] == "U"}
+    peer_types = {line.split()[-2]: line.split()[-1] for line in reported.stdout.splitlines()}
+    assert not set(peer_types) & set("dDbBCgGsS"), reported.stdout
+    called = {line.split()[-1] for line in reported.stdout.splitlines() if line.split()[-2] == "U"}
     assert called <= {"_GLOBAL_OFFSET_TABLE_", "__stack_chk_fail"}
     text = (tmp_path / f"{code.identifier}.c").read_text(encoding="ascii")
     included = {line for line in text.splitlines() if line.startswith("#include")}

@@ -113,13 +113,13 @@ class Instance:
         from fmpy import extract, read_model_description
         from fmpy.fmi2 import FMU2Slave
 
-        told = read_model_description(str(path))
-        self.references = {one.name: one.valueReference for one in told.modelVariables}
-        self.inputs = [one.name for one in told.modelVariables if one.causality == "input"]
+        reported = read_model_description(str(path))
+        self.references = {one.name: one.valueReference for one in reported.modelVariables}
+        self.inputs = [one.name for one in reported.modelVariables if one.causality == "input"]
         self.unit = FMU2Slave(
-            guid=told.guid,
+            guid=reported.guid,
             unzipDirectory=extract(str(path), str(folder)),
-            modelIdentifier=told.coSimulation.modelIdentifier,
+            modelIdentifier=reported.coSimulation.modelIdentifier,
             instanceName="one",
         )
         self.unit.instantiate()
@@ -259,15 +259,15 @@ def test_a_peer_says_what_it_hears_and_sends(tmp_path: Path) -> None:
     path, _ = written(LOSSY, tmp_path, peer="user[2]")
     with zipfile.ZipFile(path) as archive:
         archive.extractall(tmp_path)
-        told = xml.fromstring(archive.read("modelDescription.xml"))
+        reported = xml.fromstring(archive.read("modelDescription.xml"))
         names = archive.namelist()
-    causes = {one.get("name"): one.get("causality") for one in told.iter("ScalarVariable")}
+    causes = {one.get("name"): one.get("causality") for one in reported.iter("ScalarVariable")}
     received = {name for name, cause in causes.items() if cause == "input"}
     reported_by = ("coordination.x", "coordination.v", "missing")
     assert received == {f"lan.user[{k}].{what}" for k in (1, 3) for what in reported_by} | {"force on device"}
     assert causes["lan.coordination.x"] == "output"
     assert next(one for one in names if one.startswith("binaries/")).split("/")[1].endswith("64")
-    assert all(f"sources/{one.get('name')}" in names for one in told.iter("File"))
+    assert all(f"sources/{one.get('name')}" in names for one in reported.iter("File"))
 
 
 def test_its_sources_compile_strictly(tmp_path: Path) -> None:

@@ -180,10 +180,10 @@ def test_every_file_holds_the_same(
     monkeypatch.chdir(tmp_path)
     (tmp_path / "topology.yaml").write_text(AVERAGE, encoding="utf-8")
     assert run(["export", "--out", f"loop{suffix}", "--open-at", "lan", "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
+    reported = json.loads(capsys.readouterr().out)
     found = state_space(compiled(AVERAGE), open_at="lan")
     read = opened(tmp_path / f"loop{suffix}")
-    assert [told[name] for name in "abcd"] == matrices(found)
+    assert [reported[name] for name in "abcd"] == matrices(found)
     assert [np.asarray(read[name]).tolist() for name in "ABCD"] == matrices(found)
     assert float(read["dt"]) == 0.008
     if suffix == ".py":

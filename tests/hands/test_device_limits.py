@@ -9,7 +9,7 @@ import pytest
 import scipy.optimize
 
 from apc.simulation.trajectory import parse_duration, simulate
-from tests.topologies import compiled, library, replaced, told
+from tests.topologies import compiled, library, messages_of, replaced
 
 FALCON = """
 topology: pushed
@@ -107,7 +107,7 @@ def test_a_vector_stays_within_a_limit_entry_by_entry(tmp_path: Path) -> None:
 def test_what_a_clock_computes_can_have_no_limit(tmp_path: Path) -> None:
     part = replaced(SHOWN, ("= flange.x", "= sample(flange.x)"), ("{most:", "{clock: clock, most:"))
     text = replaced(PLANAR, ("flange: device}", "flange: device, clock: tick}"))
-    [line] = told(compiled, text, library(tmp_path, part))
+    [line] = messages_of(compiled, text, library(tmp_path, part))
     assert line.partition("yaml:")[2] == (
         "5:13: E513 limit of eye.seen[1]: expected a continuous variable, got one computed at ticks. "
         "Add acting = hold(seen) and declare the limit of acting."

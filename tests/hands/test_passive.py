@@ -352,9 +352,9 @@ def test_a_server_without_a_device_is_not_held() -> None:
     hands = 10 ** np.random.default_rng(3).uniform(-6, [3, 4, 7], size=(100, 3))
     for part in (0.99, 1.01):
         at = apc.set_parameters(system, {"contact.stiffness": f"{part * found!r} N/m"})
-        told = absolute_stability(numeric_model(at))
-        assert told.stable is (part < 1)
-        assert shaken(at, hands if told.stable else tuned(told)) is (part > 1)
+        reported = absolute_stability(numeric_model(at))
+        assert reported.stable is (part < 1)
+        assert shaken(at, hands if reported.stable else tuned(reported)) is (part > 1)
 
 
 @pytest.mark.parametrize("name", ["lifted-box", "star-lecture"])

@@ -11,7 +11,7 @@ import apc
 from apc.extensions.wall_conditions.overlay import overlay_points, parse_overlay, symbol_values
 from apc.haptics.wall_conditions import CONDITIONS
 from apc.parameter_values.parameter_names import ParameterRef, Range
-from tests.topologies import AVERAGE, compiled, told, wall
+from tests.topologies import AVERAGE, compiled, messages_of, wall
 
 
 @pytest.mark.parametrize(("virtual", "limit"), [(0.0, 1600.0), (0.4, 800.0), (-0.4, 800.0), (0.9, 0.0)])
@@ -90,7 +90,7 @@ def test_symbols_follow_the_topology_its_expressions_and_groups() -> None:
     )
     words = "colgate:K=contact.stiffness,B=0 N*s/m,b=a.device.damping,T=haptic.period"
     assert symbol_values(model, parse_overlay(model, words)) == (900.0, 7.0, 0.0, 0.001)
-    assert told(parse_overlay, model, words.replace("a.device", "device")) == [
+    assert messages_of(parse_overlay, model, words.replace("a.device", "device")) == [
         "overlay: E886 device.damping differs between peers, but b is a single number. "
         "Try: b=a.device.damping"
     ]
@@ -119,7 +119,7 @@ EXAMPLE = "colgate:K=contact.stiffness,B=contact.damping,b=device.damping,T=hapt
     ],
 )
 def test_a_faulty_overlay_gets_one_clear_message(text: str, message: str) -> None:
-    assert told(parse_overlay, MODEL, text) == [f"overlay: {message}"]
+    assert messages_of(parse_overlay, MODEL, text) == [f"overlay: {message}"]
 
 
 @pytest.mark.parametrize(

@@ -155,19 +155,19 @@ def test_what_yaml_1_1_would_convert_stays_a_word(word: str, message: Say) -> No
 def test_keys_that_stand_twice_are_told_together_and_mistakes_in_the_order_of_the_file(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    def told() -> list[str]:
+    def report_of() -> list[str]:
         assert run(["check", "topology.yaml"]) == 1
         lines = capsys.readouterr().err.splitlines()
         return [" ".join(line.split()[:2]) for line in lines if line.startswith("topology.yaml:")]
 
     FILE.write_text("a: 1\nb: {c: 1, 'c': 2}\na: 2\n", encoding="utf-8")
-    assert told() == ["topology.yaml:2:11: E111", "topology.yaml:3:1: E111"]
+    assert report_of() == ["topology.yaml:2:11: E111", "topology.yaml:3:1: E111"]
     wrong = [("haptic: 1 ms", "haptic: 1 kg"), ("network: 8 ms", "network: 0 s"), ("0.1 kg", "0.1")]
     wrong += [("shared: true", "shared: yes"), ("1000 N/m", "1000 N"), ("delay: 8 ms}", "delay: 8 s m}")]
     wrong += [("contact.stiffness: [0 N/m, 5000", "contact.stifness: [0 N/m, 5000")]
     FILE.write_text(replaced(AVERAGE, *wrong), encoding="utf-8")
     codes = ["4:11: E204", "5:12: E207", "9:18: E204", "10:52: E203", "12:76: E204", "15:36: E222"]
-    assert told() == [f"topology.yaml:{one}" for one in (*codes, "17:16: E206")]
+    assert report_of() == [f"topology.yaml:{one}" for one in (*codes, "17:16: E206")]
 
 
 def test_the_line_is_shown_with_a_caret_under_the_place_however_long_it_is(

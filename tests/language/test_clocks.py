@@ -8,7 +8,7 @@ import pytest
 
 import apc
 from tests.library.parts import listed, ticked, values
-from tests.topologies import ONE_MASS, compiled, library, replaced, told
+from tests.topologies import ONE_MASS, compiled, library, messages_of, replaced
 
 # ---- the tick before, and what is held ----
 
@@ -88,7 +88,7 @@ def test_a_reduction_that_is_not_linear_is_taken_over_each_pair(tmp_path: Path) 
 def test_a_pair_of_peers_does_not_know_what_all_say_together(force: str, tmp_path: Path) -> None:
     """E506 at the line, where the value of one pair would take what is heard of all at the same tick."""
     more = FOLLOWER.format(f"k*mean(others.x)', 'g = {force}").replace("hold(f)", "hold(f + g)")
-    [line] = told(compiled, FOUR, library(tmp_path, more))
+    [line] = messages_of(compiled, FOUR, library(tmp_path, more))
     assert "E506 sum(max(" in line
     assert "requests of each other peer a value that depends on all received values" in line
 
@@ -223,5 +223,5 @@ def test_the_line_to_write_for_a_reduction_that_is_sent_works(tmp_path: Path) ->
 def test_a_name_with_an_error_is_reported_once_wherever_it_is_used(clock: str, delay: str) -> None:
     text = ONE_MASS.replace("count: 1", "count: none")
     text += f"clocks: {{tick: {clock}}}\nlinks: {{lan: {{clock: tick, delay: {delay}}}}}\n"
-    [message] = told(compiled, text)
+    [message] = messages_of(compiled, text)
     assert message.startswith("topology.yaml:2:23: E2")

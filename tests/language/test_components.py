@@ -8,7 +8,7 @@ import pytest
 
 import apc
 from tests.library.parts import values
-from tests.topologies import ONE_MASS, ROOT, compiled, library, told
+from tests.topologies import ONE_MASS, ROOT, compiled, library, messages_of
 
 FILES = [
     path
@@ -48,7 +48,9 @@ def test_a_bare_number_of_a_declaration_is_in_the_unit_beside_it(tmp_path: Path)
     system = compiled(text, library(tmp_path, BALL))
     [mass] = [one for one in system.parameters if one.name == "ball.mass"]
     assert (mass.minimum, mass.exclusive_minimum, mass.maximum, mass.value) == (0.001, True, 2.0, 0.5)
-    [line] = told(compiled, text.replace("type: Ball", "type: Ball, mass: 1 g"), library(tmp_path, BALL))
+    [line] = messages_of(
+        compiled, text.replace("type: Ball", "type: Ball, mass: 1 g"), library(tmp_path, BALL)
+    )
     assert line.endswith("E207 mass: expected more than 1 g, got 1 g.")
 
 
@@ -60,5 +62,5 @@ def test_both_branches_of_an_option_are_checked(other: str, code: str, tmp_path:
         f"equations: ['flange.f = if how == one then F else {other}']\n"
     )
     text = f"{ONE_MASS}hands: {{own: {{type: Own, flange: device}}}}\n"
-    lines = told(compiled, text, library(tmp_path, own))
+    lines = messages_of(compiled, text, library(tmp_path, own))
     assert [line.split()[1] for line in lines] == ([code] if code else [])

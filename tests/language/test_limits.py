@@ -10,7 +10,7 @@ import pytest
 import apc
 from apc.__main__ import run
 from apc.analysis.model_size import model_size
-from tests.topologies import AVERAGE, compiled, library, replaced, told
+from tests.topologies import AVERAGE, compiled, library, messages_of, replaced
 
 DELAY = "delay: 8 ms}"
 LONG, SHOWN = "a" * 10_000, f"{'a' * 57}..."
@@ -23,7 +23,7 @@ def tabled(
     if text is not None:
         (folder / "users.csv").write_text(text, encoding="utf-8")
     (folder / "topology.yaml").write_text(replaced(AVERAGE, change), encoding="utf-8")
-    return [line.replace(f"{folder}/", "") for line in told(apc.compile, folder / "topology.yaml")]
+    return [line.replace(f"{folder}/", "") for line in messages_of(apc.compile, folder / "topology.yaml")]
 
 
 def test_a_table_is_refused_by_its_size_before_it_is_read(tmp_path: Path) -> None:
@@ -107,7 +107,7 @@ def test_the_delay_that_is_proposed_for_a_force_is_taken(requested: str, tmp_pat
 
 def wrong(*pairs: tuple[str, str]) -> str:
     """Return the only thing that is told when the first topology with changes is compiled and analysed."""
-    [line] = told(lambda: apc.analyze(compiled(replaced(AVERAGE, *pairs))))
+    [line] = messages_of(lambda: apc.analyze(compiled(replaced(AVERAGE, *pairs))))
     return line
 
 
@@ -140,13 +140,13 @@ def test_peers_on_a_complete_graph_have_no_limit() -> None:
 
 @pytest.mark.whole
 def test_delays_are_searched_and_varied_only_so_far() -> None:
-    assert told(lambda: apc.critical(compiled(AVERAGE), "lan.delay", upper="1e6 s")) == [
+    assert messages_of(lambda: apc.critical(compiled(AVERAGE), "lan.delay", upper="1e6 s")) == [
         "critical value: E846 from 0 s to 1e+06 s events coincide at more than 1,000 values of lan.delay, "
         "the limit of the search. Use a range up to 1 s."
     ]
     late = compiled(replaced(AVERAGE, (DELAY, "delay: 2 s}")))
     for x in ("contact.stiffness=500 N/m:900 N/m", "lan.delay=0 s:2 s"):
-        [message] = told(lambda x=x: apc.region(late, x=x, y="coordination.stiffness=0 N/m:1500 N/m"))
+        [message] = messages_of(lambda x=x: apc.region(late, x=x, y="coordination.stiffness=0 N/m:1500 N/m"))
         assert "hundreds of matrices, here of 506 states; the limit is 300" in message
 
 
@@ -191,16 +191,16 @@ def test_parts_in_parts_are_counted_where_they_are_defined(
         head = f"component: L{level}\nconnectors: {{flange: Flange}}\nparts: {{{parts}}}\n"
         texts.append(f"{head}connect: {{flange: p0.flange}}\n")
     text = f"{AVERAGE}hands: {{h: {{type: L{levels}, flange: device}}}}\n"
-    assert any(message in line for line in told(compiled, text, library(tmp_path, *texts)))
+    assert any(message in line for line in messages_of(compiled, text, library(tmp_path, *texts)))
 
 
 def test_an_array_of_composites_or_inside_one_has_a_limit(tmp_path: Path) -> None:
     pair = "component: Pair\nparts:\n  a: {type: Mass, mass: 1 kg}\n  b: {type: Mass, mass: 1 kg}\n"
     many = pair.replace("Pair", "Many").replace("Mass, mass", "Mass, count: 501, mass")
     own = library(tmp_path, pair, many)
-    [line] = told(compiled, f"{AVERAGE}hands: {{n: {{type: Pair, count: 500}}}}\n", own)
+    [line] = messages_of(compiled, f"{AVERAGE}hands: {{n: {{type: Pair, count: 500}}}}\n", own)
     assert "E216 expected at most 1000 parts at a peer" in line
-    lines = told(compiled, f"{AVERAGE}hands: {{n: {{type: Many}}}}\n", own)
+    lines = messages_of(compiled, f"{AVERAGE}hands: {{n: {{type: Many}}}}\n", own)
     assert "E208 count of a: expected a whole number from 1 to 500, got 501." in lines[0]
 
 

@@ -106,8 +106,8 @@ def _named(rows: list[tuple[str, str]]) -> Any:
 @_named(ROWS)
 def test_a_mistake_is_told_once_at_its_place(section: str, row: str, check: Any) -> None:
     text = next(iter(MODELS[section].values()))
-    told = check(section, replaced(text, (_lines(row, "-"), _lines(row, "+"))))
-    assert told == _reported(row)
+    reported = check(section, replaced(text, (_lines(row, "-"), _lines(row, "+"))))
+    assert reported == _reported(row)
 
 
 @pytest.mark.few(30)

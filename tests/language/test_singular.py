@@ -10,7 +10,7 @@ import pytest
 
 import apc
 from apc.compiler.errors import ApcError
-from tests.topologies import compiled, library, told
+from tests.topologies import compiled, library, messages_of
 
 TOPOLOGY = """
 topology: odd
@@ -162,7 +162,7 @@ peers: {{user: {{count: 2, set: {{{settings}}}}}}}
 masses: {{device: {{mass: 0.1 kg, damping: 5 N*s/m}}}}
 couplers: {{tank: {{flange: device, type: {part}}}}}
 """
-    lines = told(compiled, text, library(tmp_path, TANK, DEEP))
+    lines = messages_of(compiled, text, library(tmp_path, TANK, DEEP))
     assert [line.partition("E")[2][:3] for line in lines] == (["511"] if refused else [])
 
 
@@ -172,6 +172,6 @@ def test_two_joints_that_say_the_same_with_these_numbers_are_refused() -> None:
     gears = (
         "couplers: {g: {type: Gear, a: one, b: two, ratio: 1}, h: {type: Gear, a: one, b: two, ratio: %d}}\n"
     )
-    [line] = told(compiled, text + gears % 1)
+    [line] = messages_of(compiled, text + gears % 1)
     assert "`h.a.x = h.ratio*h.b.x` (h) is redundant" in line
-    assert told(compiled, text + gears % 2) == []
+    assert messages_of(compiled, text + gears % 2) == []

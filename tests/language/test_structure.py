@@ -11,7 +11,7 @@ import pytest
 import apc
 from tests.language.own import component, force, model, topology
 from tests.library.parts import rates, ticked
-from tests.topologies import ONE_MASS, compiled, library, told
+from tests.topologies import ONE_MASS, compiled, library, messages_of
 
 # ---- rigid connections ----
 
@@ -143,7 +143,7 @@ def test_a_factor_that_is_zero_whatever_the_motion_is_none(case: str, tmp_path: 
     text, _, zero = case.partition(" → ")
     equations = ["x = flange.x/L", "z = 2*x + 1", f"({text})*y = L", "flange.f = K*y"]
     own = component(*equations, variables="y")
-    lines = told(compiled, topology(own), library(tmp_path, own))
+    lines = messages_of(compiled, topology(own), library(tmp_path, own))
     assert bool(lines) == (zero == "zero")
 
 
@@ -156,6 +156,6 @@ SINGULAR = (Path(__file__).parent / "singular.txt").read_text(encoding="utf-8").
 def test_equations_without_an_answer_are_told_by_name(case: str, tmp_path: Path) -> None:
     equations, variables, expected = map(str.strip, case.rstrip("\n").split("\n"))
     own = component(*equations.split("; "), variables=variables)
-    lines = told(compiled, topology(own), library(tmp_path, own))
+    lines = messages_of(compiled, topology(own), library(tmp_path, own))
     assert len(lines) == 1
     assert expected in lines[0]

@@ -11,7 +11,7 @@ import pytest
 from apc.compiler.compiled import Parameter
 from apc.compiler.errors import SourceLocation
 from apc.compiler.language.units import TABULATED, parse_unit, unit_by_pint
-from tests.topologies import ONE_MASS, compiled, told
+from tests.topologies import ONE_MASS, compiled, messages_of
 
 
 @functools.cache
@@ -92,7 +92,7 @@ def test_an_angle_in_degrees_is_right_to_more_than_a_float() -> None:
     "unit", ["(((%^9)^9)^9)^9", "((((Tm^9/Tm^9)^9)^9)^9)^9", f"{'(' * 90}m{')' * 90}", "(m^9)^9", "m^999"]
 )
 def test_a_unit_is_bounded_in_every_direction(unit: str) -> None:
-    for line in told(compiled, f"{ONE_MASS}parameters:\n  p: 5 {unit}\n"):
+    for line in messages_of(compiled, f"{ONE_MASS}parameters:\n  p: 5 {unit}\n"):
         assert "E225" in line or "E222" in line
 
 

@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from tests.library.parts import rates
-from tests.topologies import compiled, library, told
+from tests.topologies import compiled, library, messages_of
 
 OWN = """\
 component: Own
@@ -87,7 +87,7 @@ def test_what_doubles_at_each_level_is_refused_before_it_fills_the_memory(tmp_pa
     nested = "cross(u, v)"
     for _ in range(30):
         nested = f"cross({nested}, v)"
-    [line] = told(compiled, topology(3), library(tmp_path, component(nested, [1.0, 2.0, 3.0])))
+    [line] = messages_of(compiled, topology(3), library(tmp_path, component(nested, [1.0, 2.0, 3.0])))
     assert (
         "the expression has more than 10000 terms, all entries included; give a subexpression a name" in line
     )

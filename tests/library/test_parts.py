@@ -14,7 +14,7 @@ import pytest
 
 import apc
 from tests.library.parts import CLOCK, TWO, coupled, held, pushes, rates, ticked, values
-from tests.topologies import ONE_MASS, compiled, library, replaced, told
+from tests.topologies import ONE_MASS, compiled, library, messages_of, replaced
 
 EXACT = 1e-13  # a few roundings
 
@@ -227,7 +227,7 @@ def test_stylus_arms_have_the_published_values_and_keep_to_their_limits(name: st
         assert values(system)[f"it.{word}"] == nominal
         for limit, beyond in ((low, 0.999 * low), (high, 1.001 * high)):
             assert values(held(f"{part}, {word}: {limit} {unit}"))[f"it.{word}"] == limit
-            (line,) = told(held, f"{part}, {word}: {beyond} {unit}")
+            (line,) = messages_of(held, f"{part}, {word}: {beyond} {unit}")
             assert f" E207 {word}: expected {limit:g} {unit} or " in line
     (_, m, _), (_, b, _), (_, k, _) = STYLUS_ARMS[name]
     assert in_a_second(system) == pytest.approx(swings(2 + m, 3 + b, k), rel=1e-12)
@@ -274,5 +274,5 @@ def test_a_table_is_handed_on_to_a_part_inside(tmp_path: Path) -> None:
     path.write_text(ONE_MASS + hands, encoding="utf-8")
     assert pushes(apc.compile(path), {}) == pytest.approx([2.0], rel=1e-14)
     library(tmp_path, tabled.replace("UNIT", "mm"))
-    [line] = told(apc.compile, path)
+    [line] = messages_of(apc.compile, path)
     assert "E204 force: expected N, got mm." in line

@@ -116,7 +116,7 @@ def test_a_remote_proxy_follows_the_others_device(delay: int) -> None:
     follow = pulling(lambda x, v, received: 300 * (x - mean(received, 0)) + 5 * (v - mean(received, 1)))
     text = replaced(topology("two-users-proxies"), ("delay: 8 ms, loss", f"delay: {delay} ms, loss"))
     bodies = [[(0.1, 5.0 + 2.0, 50.0), (0.1, 1.0, 0.0)]] * 2
-    same(compiled(text), ByHand(bodies, everybody(2), follow, told=0, late=delay))
+    same(compiled(text), ByHand(bodies, everybody(2), follow, first_sent=0, late=delay))
 
 
 @pytest.mark.few(5)
@@ -137,7 +137,9 @@ def test_a_reported_average_is_a_mean_begun_anew_at_each_packet(ratio: int, dela
         ("network: 8 ms", f"network: {ratio} ms"),
         ("delay: 8 ms", f"delay: {delay} ms"),
     )
-    hand = ByHand([[DEVICE, CUBE]] * 2, everybody(2), law, told=1, memory=1, out=1, ratio=ratio, late=delay)
+    hand = ByHand(
+        [[DEVICE, CUBE]] * 2, everybody(2), law, first_sent=1, memory=1, out=1, ratio=ratio, late=delay
+    )
     same(compiled(text), hand)
 
 
@@ -179,7 +181,7 @@ def test_a_wave_coupling_is_its_law(delay: int, cutoff: float | None, correction
     name = "two-users-waves" if cutoff is None else "two-users-filtered-waves"
     law = waves(correction=correction, cutoff=cutoff)
     memory = 1 if cutoff is None else 2
-    hand = ByHand([[DEVICE, CUBE]] * 2, everybody(2), law, told=1, memory=memory, out=1, late=delay)
+    hand = ByHand([[DEVICE, CUBE]] * 2, everybody(2), law, first_sent=1, memory=memory, out=1, late=delay)
     assert magnitudes(hand)[0] == (1 if correction else 2)
     same(compiled(replaced(topology(name), change, ("delay: 8 ms", f"delay: {delay} ms"))), hand)
 
@@ -203,7 +205,7 @@ def test_a_served_object_is_its_law(delay: int) -> None:
 
     text = replaced(topology("client-server"), ("delay: 8 ms, graph", f"delay: {delay} ms, graph"))
     bodies = [[(0.6, 5.0, 0.0)], *[[(0.05, 5.0, 0.0), DEVICE]] * 3]
-    hand = ByHand(bodies, [[1, 2, 3], [0], [0], [0]], law, told=0, out=1, late=delay)
+    hand = ByHand(bodies, [[1, 2, 3], [0], [0], [0]], law, first_sent=0, out=1, late=delay)
     same(compiled(text), hand)
     same(compiled(text), hand, "determinant")
 
@@ -220,7 +222,7 @@ def test_a_scaled_spring_and_damper_joins_unlike_devices(scale: float, force: fl
         ("_scale: 0.25, contact.force_scale: 0.25", f"_scale: {scale}, contact.force_scale: {force}"),
         ("stiffness: 1000 N/m", "stiffness: 1000 N/m, damping: 2 N*s/m"),
     )
-    same(compiled(text), ByHand([[DEVICE, THIRD], [(0.4, 8.0, 0.0), THIRD]], everybody(2), law, told=1))
+    same(compiled(text), ByHand([[DEVICE, THIRD], [(0.4, 8.0, 0.0), THIRD]], everybody(2), law, first_sent=1))
 
 
 def test_weights_bend_springs_and_decide_nothing_of_stability() -> None:
@@ -231,7 +233,7 @@ def test_weights_bend_springs_and_decide_nothing_of_stability() -> None:
     assert run["user[1].box.x"][-1] == pytest.approx(below - weight / 1000, abs=1e-6)
     pull = pulling(lambda x, v, received: 300 * (x - mean(received, 0)), damping=2)
     bodies = [[(0.3, 5.0 + 2.0, 200.0), CUBE]] * 2
-    same(compiled(topology("lifted-box")), ByHand(bodies, everybody(2), pull, told=1))
+    same(compiled(topology("lifted-box")), ByHand(bodies, everybody(2), pull, first_sent=1))
 
 
 def test_a_tool_in_two_hands_moves_as_its_middle_does() -> None:
@@ -243,7 +245,7 @@ def test_a_tool_in_two_hands_moves_as_its_middle_does() -> None:
 
     apart = (0.05, 2.5, 0.0)  # the hands against each other: half of one device
     bodies = [[(0.1 + 0.1 + 0.2, 5.0 + 5.0, 0.0), CUBE, apart]] * 2
-    same(compiled(topology("two-handed-tool")), ByHand(bodies, everybody(2), law, told=1))
+    same(compiled(topology("two-handed-tool")), ByHand(bodies, everybody(2), law, first_sent=1))
 
 
 @pytest.mark.parametrize("damping", [0.0, 0.2])
@@ -263,5 +265,6 @@ def test_a_beam_in_two_hands_is_pulled_and_turned_by_its_ends(damping: float) ->
     more = f"damping: {damping} N*s/m, turn_damping: {damping} N*m*s/rad, turn_stiffness"
     both = (("turn_stiffness", more), ("500 N/m", f"500 N/m, damping: {damping} N*s/m"))
     same(
-        compiled(replaced(topology("carried-beam"), *both)), ByHand(bodies, everybody(2), law, told=2, many=3)
+        compiled(replaced(topology("carried-beam"), *both)),
+        ByHand(bodies, everybody(2), law, first_sent=2, many=3),
     )

@@ -77,7 +77,7 @@ def test_passivity_controller_is_its_law(largest: float) -> None:
             "type: SpringDamperArm, flange: device, stiffness: 100 N/m",
         ),
     )
-    hand = ByHand([[(0.1, 0.2, 100.0)]], [[]], law, told=0, memory=3, comp=0)
+    hand = ByHand([[(0.1, 0.2, 100.0)]], [[]], law, first_sent=0, memory=3, comp=0)
     same(run_of(text, "500 ms"), played(hand, [[(-0.01, 0.0)]], [[-0.01, 0.0, 0.0]], 500), "device")
 
 
@@ -124,7 +124,7 @@ def test_passivity_controlled_average_is_its_law(delay: int, largest: float) -> 
         ("push.force: 2 N", "push.force: 0 N, device.x: 20 mm"),
     )
     body = [(0.1, 5.0 + 2.0, 100.0), (0.3, 1.0, 0.0)]
-    hand = ByHand([body] * 2, everybody(2), law, told=1, memory=8, out=1, late=delay)
+    hand = ByHand([body] * 2, everybody(2), law, first_sent=1, memory=8, out=1, late=delay)
     starts = [[(0.02, 0.0), (0.0, 0.0)], [(0.0, 0.0)] * 2]
     same(run_of(text, "600 ms"), played(hand, starts, [[0.0] * 8] * 2, 600), "device", "cube")
 
@@ -174,7 +174,7 @@ def test_set_position_modulation_with_energy_enough_is_a_spring_and_damper() -> 
         COPIES.replace("haptic, link", "haptic, damping: 6 N*s/m, link"),
         ("TYPE", "SetPositionModulation, energy: 1e6 J, ceiling: 1e7 J"),
     )
-    hand = ByHand([[(1.0, 6.0, 500.0)]] * 2, everybody(2), law, told=0, late=50, comp=0)
+    hand = ByHand([[(1.0, 6.0, 500.0)]] * 2, everybody(2), law, first_sent=0, late=50, comp=0)
     found = apc.analyze(compiled(text))
     assert found.spectral_radius == pytest.approx(magnitudes(hand)[1], abs=1e-10)
     assert found.linearized
@@ -192,17 +192,17 @@ def test_dead_reckoning_is_its_law(delay: int, threshold: float) -> None:
     """The hearer knows when a packet was sent: it goes on from there by its age at each tick."""
 
     def law(_: int, x: Sequence[tuple[Any, Any]], received: Packets, memory: Sequence[Any]) -> Any:
-        course, told, packets = memory
-        by_then = course + TICK * told
+        course, reported, packets = memory
+        by_then = course + TICK * reported
         if packets and abs(x[1][0] - by_then) < threshold:
             course = by_then
         else:
-            course, told, packets = *x[1], packets + 1
+            course, reported, packets = *x[1], packets + 1
         ((_, _, line, speed, age),) = received.values()
         ahead = line + age * speed
         pull = 200 * (x[1][0] - ahead) + 5 * (x[1][1] - speed)
         push = contact(x)
-        return [-push, push - pull], [course, told, packets], [course + TICK * told, told]
+        return [-push, push - pull], [course, reported, packets], [course + TICK * reported, reported]
 
     text = replaced(
         RECKONED,
@@ -211,7 +211,7 @@ def test_dead_reckoning_is_its_law(delay: int, threshold: float) -> None:
         ("push.force: 2 N", "push.force: 0 N, device.x: 20 mm"),
     )
     body = [(0.1, 5.0 + 2.0, 100.0), (0.3, 5.0, 0.0)]
-    hand = ByHand([body] * 2, everybody(2), law, told=1, memory=3, out=2, late=delay)
+    hand = ByHand([body] * 2, everybody(2), law, first_sent=1, memory=3, out=2, late=delay)
     starts = [[(0.02, 0.0), (0.0, 0.0)], [(0.0, 0.0)] * 2]
     same(run_of(text, "500 ms"), played(hand, starts, [[0.0] * 3] * 2, 500), "device", "cube")
 

@@ -99,7 +99,7 @@ def by_hand(law: Law, late: int) -> ByHand:
     def forces(_: int, x: Motion, received: Packets, memory: Sequence[Any]) -> Any:
         return [-law(x, received)], memory, []
 
-    return ByHand([[(0.2, 5.0, 0.0)]] * 3, everybody(3), forces, told=0, ratio=4, late=late)
+    return ByHand([[(0.2, 5.0, 0.0)]] * 3, everybody(3), forces, first_sent=0, ratio=4, late=late)
 
 
 def same(system: Model, hand: ByHand, method: str = "auto") -> None:
@@ -137,7 +137,7 @@ def test_a_simulation_is_the_law_played(force: str, late: int, tmp_path: Path) -
         now, ticks = ticks // 3 * 1e-3, ticks + 1
         return [-law(x, {j: [*one[:-1], min(one[-1], now)] for j, one in received.items()})], memory, []
 
-    hand = ByHand([[(0.2, 5.0, 0.0)]] * 3, everybody(3), forces, told=0, ratio=4, late=late)
+    hand = ByHand([[(0.2, 5.0, 0.0)]] * 3, everybody(3), forces, first_sent=0, ratio=4, late=late)
     expected = played(hand, [[(0.001, 0.0)], [(-0.001, 0.0)], [(-0.001, 0.0)]], [[], [], []], len(found))
     assert np.ptp(expected, axis=0).min() > 1e-4
     assert found == pytest.approx(expected, abs=SAME)
@@ -162,7 +162,7 @@ def test_what_was_heard_before_is_its_law(force: str, late: int, tmp_path: Path)
             pull = now - sum(memory) / 2
         return [-300 * pull], others, []
 
-    hand = ByHand([[(0.2, 5.0, 0.0)]] * 3, everybody(3), law, told=0, memory=2, ratio=4, late=late)
+    hand = ByHand([[(0.2, 5.0, 0.0)]] * 3, everybody(3), law, first_sent=0, memory=2, ratio=4, late=late)
     system = topology(force, f"{late} ms", tmp_path)
     same(system, hand)
     starts = [0.001, -0.001, -0.001]

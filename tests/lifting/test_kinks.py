@@ -21,7 +21,7 @@ from apc.studies.clock_periods import NominalPeriodPath
 from apc.studies.parameter_path import LOCATION
 from apc.studies.timing_values import system_with_delay
 from tests.language.own import component
-from tests.topologies import TOPOLOGIES, compiled, library, told
+from tests.topologies import TOPOLOGIES, compiled, library, messages_of
 
 MASS, DAMPING, PERIOD = 1.0, 20.0, 1e-3  # kg, N·s/m, s
 
@@ -176,7 +176,7 @@ def test_passive_hands_meet_the_whole_wall() -> None:
 
 def test_a_force_that_jumps_has_no_linearization(tmp_path: Path) -> None:
     for force in (f"F*sign({X}/L)", f"if {X} > 0 then F else 0"):
-        (line,) = told(apc.analyze, model(tmp_path, force))
+        (line,) = messages_of(apc.analyze, model(tmp_path, force))
         assert "E808" in line
         assert "jumps" in line
         alongside = apc.analyze(model(tmp_path, force, x="1 mm"))
@@ -191,7 +191,7 @@ def test_many_kinks_are_combined_or_refused_by_name(tmp_path: Path) -> None:
         peers = ", ".join(f"u{k}: {{count: 1, set: {{own.K: {k}0000 N/m}}}}" for k in range(1, count + 1))
         system = compiled(topology().replace("user: {count: 1}", peers), shelf)
         if count == 5:
-            (line,) = told(apc.analyze, system)
+            (line,) = messages_of(apc.analyze, system)
             assert "E808" in line
             assert "own.f" in line
             continue
@@ -244,13 +244,15 @@ def test_a_kink_for_each_of_several_senders_is_refused(tmp_path: Path) -> None:
         "couplers: {own: {type: Pushes, object: cube, K: 1000 N/m, clock: tick, link: lan}}\n"
         "links: {lan: {clock: tick, delay: 0 ms}}\n"
     )
-    (line,) = told(apc.analyze, compiled(text, library(tmp_path, EDGES)))
+    (line,) = messages_of(apc.analyze, compiled(text, library(tmp_path, EDGES)))
     assert "E808 own.f has a kink for each peer from which it receives over lan" in line
 
 
 def test_a_value_at_one_point_alone_is_a_jump(tmp_path: Path) -> None:
     """At rest the force is 0, and 60 kN wherever the device moves to."""
-    (line,) = told(apc.analyze, model(tmp_path, f"if {X} == 0 then 0 else K*L", ", K: 60000 N/m, L: 1 m"))
+    (line,) = messages_of(
+        apc.analyze, model(tmp_path, f"if {X} == 0 then 0 else K*L", ", K: 60000 N/m, L: 1 m")
+    )
     assert "E808 own.f jumps at the initial state" in line
 
 
@@ -260,7 +262,7 @@ def test_a_floor_has_a_side_before_and_behind_each_whole_number(tmp_path: Path) 
     assert sorted(side.spectral_radius for side in found.sides) == pytest.approx(
         sorted([radius(30e3), radius(30e3, -120.0)]), abs=1e-12
     )
-    (line,) = told(apc.analyze, model(tmp_path, f"F*floor({X}/L)"))
+    (line,) = messages_of(apc.analyze, model(tmp_path, f"F*floor({X}/L)"))
     assert "jumps" in line
 
 
@@ -323,7 +325,7 @@ def test_a_kink_inside_a_nonlinear_loop_is_refused_and_beside_it_is_not(tmp_path
     loop = component("z + z^3/L^2 = max(0, flange.x)", "flange.f = K*z", variables="z:")
     shelf = library(tmp_path, loop)
     text = topology(", K: 100 N/m").replace(", clock: tick", "")
-    (line,) = told(apc.analyze, compiled(text, shelf))
+    (line,) = messages_of(apc.analyze, compiled(text, shelf))
     assert "E808" in line
     assert "nonlinear loop" in line
     behind = compiled(text.replace("x: 0 m", "x: 1 mm"), shelf)

@@ -160,14 +160,14 @@ def test_what_depends_on_a_column_is_worked_out_peer_by_peer(tmp_path: Path) -> 
 @pytest.mark.whole
 def test_what_is_set_for_all_groups_says_what_each_of_them_has(capsys: pytest.CaptureFixture[str]) -> None:
     """The star's teacher holds on with 400 N/m of its own, its students with the part's 100 N/m."""
-    told = (
+    reported = (
         "arm.stiffness has one value for all groups here; the topology has 400 N/m at teacher, 100 N/m "
         "at student"
     )
     star = compile_topology(TOPOLOGIES / "star-lecture.yaml")
-    assert told in analyze_many(star, {"arm.stiffness": [100.0, 400.0]}).limitations
+    assert reported in analyze_many(star, {"arm.stiffness": [100.0, 400.0]}).limitations
     assert run(["analyze", str(TOPOLOGIES / "star-lecture.yaml"), "--set", "arm.stiffness=100 N/m"]) == 0
-    assert capsys.readouterr().err == f"note: {told}\n"
+    assert capsys.readouterr().err == f"note: {reported}\n"
 
 
 @pytest.mark.whole

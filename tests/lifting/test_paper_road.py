@@ -11,7 +11,7 @@ from scipy.linalg import expm
 
 from apc.extensions.paper_method.lifted_matrices import analyze_paper, paper_method
 from tests.sites import paper
-from tests.topologies import AVERAGE, MESH, compiled, replaced, told
+from tests.topologies import AVERAGE, MESH, compiled, messages_of, replaced
 
 
 def test_the_shapes_are_the_papers() -> None:
@@ -76,7 +76,7 @@ def test_at_the_boundary_it_says_that_its_matrix_is_not_proved() -> None:
     ],
 )
 def test_a_topology_of_another_form_is_told_what_is_missing(old: str, new: str, missing: str) -> None:
-    [message] = told(paper_method, compiled(AVERAGE.replace(old, new)))
+    [message] = messages_of(paper_method, compiled(AVERAGE.replace(old, new)))
     assert missing in message
 
 

@@ -9,7 +9,7 @@ import pytest
 
 import apc
 from tests.language.own import component
-from tests.topologies import compiled, library, told
+from tests.topologies import compiled, library, messages_of
 
 # A device of 0.1 kg against a wall that is computed every ms.
 WALL = """\
@@ -93,7 +93,7 @@ def test_a_replacement_that_does_not_fit_is_refused_at_its_place(
     topology = WALL.format(
         damping="1 N*s/m", flange="device", stiffness="1 N/m", more="\n  own: {type: Own, flange: device}"
     )
-    lines = told(compiled, topology, library(tmp_path, text))
+    lines = messages_of(compiled, topology, library(tmp_path, text))
     assert any(words in line and "part0.yaml" in line for line in lines), lines
 
 

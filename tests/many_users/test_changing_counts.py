@@ -122,5 +122,5 @@ def test_the_command_prints_text_and_json(cli: Cli, tmp_path: Path) -> None:
     printed = cli("analyze", str(AVERAGE), "--changing", "user.count=2:3")
     assert printed.code == 0 and "stable under arbitrary changes" in printed.out
     assert max(map(len, printed.out.splitlines())) <= 80
-    told = cli("analyze", str(AVERAGE), "--changing", "user.count=2:5", "--json")
-    assert '"dwell_s": 0.096' in told.out
+    reported = cli("analyze", str(AVERAGE), "--changing", "user.count=2:5", "--json")
+    assert '"dwell_s": 0.096' in reported.out

@@ -110,12 +110,12 @@ def _matrices(seed: int) -> list[tuple[str, Floats, Floats, list[Floats]]]:
 )
 @pytest.mark.parametrize("method", METHODS)
 def test_every_matrix_within_the_error_has_its_eigenvalues_within_the_bounds(method: str, seed: int) -> None:
-    told = 0
+    reported = 0
     for name, matrix, error, truths in _matrices(seed):
         printed = METHODS[method](matrix, error)
         if printed is None:
             continue
-        told += 1
+        reported += 1
         values, errors, low, high = printed
         for true in truths:
             size = np.abs(true).max()
@@ -123,7 +123,7 @@ def test_every_matrix_within_the_error_has_its_eigenvalues_within_the_bounds(met
             assert size <= high * (1 + 1e-15), name
             for value, bound in zip(values, errors, strict=True):
                 assert np.abs(true - value).min() <= bound + 1e-15 * abs(value) + 1e-25, name
-    assert told >= 3
+    assert reported >= 3
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -225,8 +225,8 @@ def test_files_have_gaps_where_a_peer_is_absent(cli: Cli, tmp_path: Path) -> Non
     assert [row[first] == "" for row in rows] == [at >= 160 for at in range(201)]
     assert [row[third] == "" for row in rows] == [at < 80 for at in range(201)]
     assert (tmp_path / "run.svg").stat().st_size > 10_000
-    told = cli("simulate", str(AVERAGE), *times, "--json")
-    assert '"joins_s": {\n      "user[3]": "2/25"' in told.out
+    reported = cli("simulate", str(AVERAGE), *times, "--json")
+    assert '"joins_s": {\n      "user[3]": "2/25"' in reported.out
 
 
 def test_the_experiment_of_a_topology_has_joins_and_leaves(cli: Cli, tmp_path: Path) -> None:

@@ -61,9 +61,11 @@ def test_of_many_peers_it_is_an_estimate_that_says_so(
     found = decided(topology(5, stiffness, loss=burst(0.01, packets)))
     assert not found.exact and found.error is not None
     assert found.verdict == f"probably {'un' if three > 1 else ''}stable in mean square"
-    told = re.search(r"estimate: joint moments of at most 3 .* with 2 the radius is ([\d.]+)", found.notes[0])
+    reported = re.search(
+        r"estimate: joint moments of at most 3 .* with 2 the radius is ([\d.]+)", found.notes[0]
+    )
     # The reference leaves out moments of more tags in each channel's own basis: not quite the same set.
-    assert told and float(told[1]) == pytest.approx(two, abs=5e-8)
+    assert reported and float(reported[1]) == pytest.approx(two, abs=5e-8)
     assert found.mean_square_radius == pytest.approx(three, abs=1e-9 if packets == 3 else found.error)
 
 

@@ -71,8 +71,8 @@ def test_a_run_does_not_depend_on_how_many_there_are_or_who_plays_it(
     assert of_all.standard_error == pytest.approx(np.std(settled, ddof=1) / math.sqrt(len(settled)))
     alone, _ = run_simulation(prepare(compiled(text), Settings(Fraction(1, 2), seed=3, jit=jit)), [])
     assert alone.largest_force is not None
-    told = (few[0].verdict, few[0].settled, few[0].largest_force)
-    assert told == (alone.verdict, alone.settled, alone.largest_force[1])
+    reported = (few[0].verdict, few[0].settled, few[0].largest_force)
+    assert reported == (alone.verdict, alone.settled, alone.largest_force[1])
 
 
 def test_a_shares_interval_is_wilsons() -> None:
@@ -94,12 +94,12 @@ def test_runs_agree_with_the_judgedin_mean_square_and_take_the_time_of_its_growt
         assert found.mean_square.verdict == verdict and found.agrees
     assert stable.calm == 6
     assert "6 of 6 runs decay or are at rest. The runs agree with the verdict." in printed(stable)
-    told = stable.mean_square
-    assert told is not None and told.settles_in is not None
+    reported = stable.mean_square
+    assert reported is not None and reported.settles_in is not None
     # After this time the root of a mean square is a twentieth of what it was.
     decided = apc.mean_square_stability(compiled(moved(1000)))
     assert decided is not None and decided.mean_square_radius is not None
-    assert decided.mean_square_radius ** (told.settles_in / 0.008 / 2) == pytest.approx(0.05, rel=1e-9)
+    assert decided.mean_square_radius ** (reported.settles_in / 0.008 / 2) == pytest.approx(0.05, rel=1e-9)
 
 
 @pytest.mark.whole

@@ -64,9 +64,9 @@ def test_derivatives_are_those_of_moments_followed_event_by_event() -> None:
 @pytest.mark.parametrize("loss", ["{p: 1.1 %, r: 10 %}", "100 %"])
 def test_where_one_value_takes_long_or_is_not_judged_margins_say_so(loss: str) -> None:
     system = system_of(topology(3, 500.0, loss=loss))
-    told = grown(system)
-    assert not told.rows and re.match(
-        r"not computed: (one mean-square analysis|the mean-square verdict)", told.note
+    reported = grown(system)
+    assert not reported.rows and re.match(
+        r"not computed: (one mean-square analysis|the mean-square verdict)", reported.note
     )
     why = network_sensitivities(numeric_model(system)).note
     assert why.startswith("sensitivities not computed")

@@ -93,8 +93,8 @@ def test_a_topology_is_played_and_written_out_with_one_delay(
 @pytest.mark.whole
 def test_an_analysis_answers_for_the_network_first(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["analyze", "s.yaml", "--method", "paper", "--nominal"]) == 0
-    told, _, nominal = capsys.readouterr().out.partition("\n\nthree-users-average: ")
-    assert told.startswith("three-users-average: stable in mean square\n")
+    reported, _, nominal = capsys.readouterr().out.partition("\n\nthree-users-average: ")
+    assert reported.startswith("three-users-average: stable in mean square\n")
     assert nominal.splitlines()[1].startswith(f"  {LEFT_OUT[:55]}")
 
 

@@ -82,11 +82,11 @@ def test_verdicts_are_those_of_moments_followed_pattern_by_pattern(
     printed = f"loss: {{p: {law.p!r}, r: {law.r!r}, 1-h: {law.bad_loss!r}, 1-k: {law.good_loss!r}}}"
     printed += ", on_loss: zero" if law.zero else ""
     text = replaced(text_of(topology), ("lan: {clock: network, ", f"lan: {{clock: network, {printed}, "))
-    told = apc.mean_square_stability(compiled(text))
-    assert told is not None
-    if told.mean_square_radius is None:
+    reported = apc.mean_square_stability(compiled(text))
+    assert reported is not None
+    if reported.mean_square_radius is None:
         return
     truth = second_moment_radius(topology, law)
-    room = ITERATED * max(truth, 1.0) + ((told.error or 0.0) if told.exact else ESTIMATED)
-    assert abs(told.mean_square_radius - truth) <= room, (told, truth)
-    assert told.stable in (None, truth < 1) or abs(truth - 1) <= room, (told, truth)
+    room = ITERATED * max(truth, 1.0) + ((reported.error or 0.0) if reported.exact else ESTIMATED)
+    assert abs(reported.mean_square_radius - truth) <= room, (reported, truth)
+    assert reported.stable in (None, truth < 1) or abs(truth - 1) <= room, (reported, truth)

@@ -228,7 +228,9 @@ def test_the_keys_are_those_of_the_link_that_was_recorded(tmp_path: Path, distri
     # Of 20,000 the standard errors of a median and of a distance of quartiles are below 0.01 of the jitter.
     assert found.distribution.delay == pytest.approx(0.02, abs=5 * 0.01 * 0.003)
     assert found.distribution.jitter == pytest.approx(0.003, rel=5 * 0.01)
-    assert not any("distributions" in told or "follow one another" in told for told in found.limitations)
+    assert not any(
+        "distributions" in reported or "follow one another" in reported for reported in found.limitations
+    )
 
 
 @pytest.mark.whole
@@ -292,8 +294,13 @@ def test_the_command(
     monkeypatch.chdir(tmp_path)
     Path("p.txt").write_text(IPUTILS, encoding="utf-8")
     assert run(["network", "p.txt", "--json", "--out", "t.csv"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert (told["packets"], told["lost"]["count"], told["lost"]["share"], told["reordered"]) == (
+    reported = json.loads(capsys.readouterr().out)
+    assert (
+        reported["packets"],
+        reported["lost"]["count"],
+        reported["lost"]["share"],
+        reported["reordered"],
+    ) == (
         6,
         3,
         0.5,

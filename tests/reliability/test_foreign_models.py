@@ -21,7 +21,7 @@ from apc.compiler import cache, signing, store
 from apc.compiler.compiled import Model
 from tests.commands import write
 from tests.reliability.test_unchanged_topologies import PART, TEXT
-from tests.topologies import AVERAGE, ROOT, compiled, replaced, told
+from tests.topologies import AVERAGE, ROOT, compiled, messages_of, replaced
 
 Other = Callable[[], Model]
 MODEL = Path("topology.apc")
@@ -125,7 +125,7 @@ def test_lines_of_somebody_else_run_nothing_and_stand_for_no_topology(
     for file in ("topology.yaml",) if "2" in theirs else ("topology.yaml", "topology.apc"):
         right = apc.analyze(compiled(AVERAGE)).spectral_radius
         assert apc.analyze(file).spectral_radius == right, "the texts decide"
-    assert bool(told(apc.load, MODEL)) == ("2" in theirs), "it is stale"
+    assert bool(messages_of(apc.load, MODEL)) == ("2" in theirs), "it is stale"
     assert not list(Path().rglob("PWNED*"))
     assert (unchanged(capsys), MODEL.read_bytes()) == (False, mine)
 
@@ -207,7 +207,7 @@ def test_what_a_model_says_it_was_made_from_is_refused_or_compiled_and_not_looke
     """Who reads the pipe waits for ever."""
     os.mkfifo("pipe")
     forge((text, b""), **fields)
-    refused = told(other)
+    refused = messages_of(other)
     assert re.match(words, refused[0]) if words else refused or other().peers == 3
 
 
@@ -216,7 +216,7 @@ def test_what_a_models_texts_name_is_read_from_the_model_alone(name: str, other:
     write("secret.csv", "device.mass [kg]\n1\n2\n")
     write("../secret.csv", "device.mass [kg]\n1\n2\n")
     forge(("topology.yaml", replaced(AVERAGE, ("count: 3", f"table: {name}")).encode()))
-    [line] = told(other)
+    [line] = messages_of(other)
     assert line.startswith("topology.yaml:") and f"{name} does not exist" in line
 
 
@@ -250,7 +250,7 @@ NEWER = f"topology.apc: E603 has format version 99, this program reads version {
 )
 def test_what_is_no_model_is_refused_and_beside_its_topology_passed_over(content: str, words: str) -> None:
     MODEL.write_bytes(content.encode("latin-1"))
-    assert re.match(words, told(apc.load, MODEL)[0])
+    assert re.match(words, messages_of(apc.load, MODEL)[0])
     write("topology.yaml", AVERAGE)
     assert apc.analyze("topology.yaml").topology == "three-users-average"
 
@@ -262,7 +262,7 @@ def test_a_byte_changed_or_an_end_cut_off_is_refused(other: Other) -> None:
     for end in range(whole, len(data), 1_999):
         for rest in (b"", bytes([data[end] ^ 1]) + data[end + 1 :]):
             MODEL.write_bytes(data[:end] + rest)
-            assert re.match(DAMAGED, told(other)[0])
+            assert re.match(DAMAGED, messages_of(other)[0])
 
 
 @pytest.mark.parametrize(
@@ -285,4 +285,4 @@ def test_what_is_not_there_or_a_folder_or_too_large_is_told(
     os.truncate("large.apc", 2**40)
     apc.save(compiled(AVERAGE), MODEL)
     monkeypatch.setattr(cache, "LARGEST_ORIGIN", 100)
-    assert told(apc.load, name) == [f"{name}: {words}"]
+    assert messages_of(apc.load, name) == [f"{name}: {words}"]

@@ -83,8 +83,8 @@ def test_a_failed_request_is_logged_without_the_token() -> None:
     try:
         raise OSError("of somebody else")
     except OSError:
-        told = sys.exc_info()
-    record = logging.LogRecord("tornado", logging.ERROR, "", 0, "GET /?token=%s\nmore", ("secret",), told)
+        reported = sys.exc_info()
+    record = logging.LogRecord("tornado", logging.ERROR, "", 0, "GET /?token=%s\nmore", ("secret",), reported)
     assert server._without_token("secret", record)
     assert (record.getMessage(), record.exc_info) == ("a request failed: OSError('of somebody else')", None)
     wrong = logging.LogRecord("bokeh", logging.ERROR, "", 0, "token secret of %s", (1, 2), None)

@@ -22,7 +22,7 @@ from apc.realtime.run_folder import read_run
 from apc.support.processes import digest_of
 from tests.fuzz.models import recorded
 from tests.surfaces.wire import Wire, loop_at
-from tests.topologies import AVERAGE, compiled, told
+from tests.topologies import AVERAGE, compiled, messages_of
 
 
 @pytest.fixture
@@ -40,11 +40,11 @@ def changed(folder: Path, **how: Callable[[Any], Any]) -> None:
     path = folder / "user-1.npz"
     with np.load(path) as found:
         arrays = dict(found)
-    told = json.loads(arrays["record"].tobytes())
+    reported = json.loads(arrays["record"].tobytes())
     for name, change in how.items():
-        stored = told if name in told else arrays
+        stored = reported if name in reported else arrays
         stored[name] = change(stored[name])
-    arrays["record"] = np.frombuffer(json.dumps(told).encode(), np.uint8)
+    arrays["record"] = np.frombuffer(json.dumps(reported).encode(), np.uint8)
     np.savez_compressed(path, **arrays)
 
 
@@ -98,7 +98,7 @@ def test_what_no_peer_of_the_topology_can_have_done_is_refused(
 ) -> None:
     assert len(read_run(stored).peers) == 2
     changed(stored, **{name: change})
-    (message,) = told(read_run, stored)
+    (message,) = messages_of(read_run, stored)
     assert message.startswith(f"{stored / 'user-1.npz'}: E973 is not a peer of this run: {why}")
 
 
@@ -106,7 +106,7 @@ def test_a_run_beside_another_topology_is_refused(stored: Path) -> None:
     """One of the same structure, whose numbers differ: what happened would be laid beside its motion."""
     found = apc.load(stored / "topology.apc")
     apc.save(apc.set_parameters(found, {"coordination.stiffness": "600 N/m"}), stored / "topology.apc")
-    assert "E973 its topology.apc is not the topology of the run" in told(lambda: read_run(stored))[0]
+    assert "E973 its topology.apc is not the topology of the run" in messages_of(lambda: read_run(stored))[0]
 
 
 def test_what_is_no_file_of_a_peer_is_refused_at_once(stored: Path) -> None:
@@ -115,15 +115,18 @@ def test_what_is_no_file_of_a_peer_is_refused_at_once(stored: Path) -> None:
     path.write_bytes(
         bomb.getvalue().replace((8 << 20).to_bytes(4, "little"), (1 << 31).to_bytes(4, "little"))
     )
-    assert "E973 is not a peer of this run: it unpacks to more than 1024 MiB." in told(read_run, stored)[0]
+    assert (
+        "E973 is not a peer of this run: it unpacks to more than 1024 MiB."
+        in messages_of(read_run, stored)[0]
+    )
     path.unlink()
     os.mkfifo(path)  # who opens it waits for ever
-    assert "E973 is not a peer of this run: is a device, pipe or socket." in told(read_run, stored)[0]
+    assert "E973 is not a peer of this run: is a device, pipe or socket." in messages_of(read_run, stored)[0]
     path.unlink()
     path.symlink_to("user-2.npz")
-    assert "E973 contains a peer twice" in told(read_run, stored)[0]
+    assert "E973 contains a peer twice" in messages_of(read_run, stored)[0]
     (stored / "user-3.npz").symlink_to("user-2.npz")
-    assert "E973 has 3 peers of a topology with 2" in told(read_run, stored)[0]
+    assert "E973 has 3 peers of a topology with 2" in messages_of(read_run, stored)[0]
 
 
 def test_a_run_is_not_written_to_where_links_in_its_folder_lead(stored: Path, tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ import pytest
 import apc
 from apc.__main__ import run
 from apc.compiler import cache, files, store
-from tests.topologies import replaced, told
+from tests.topologies import messages_of, replaced
 
 TOPOLOGY, MODEL, TABLE = Path("topology.yaml"), Path("topology.apc"), Path("users.csv")
 PART = """\
@@ -72,7 +72,7 @@ def test_a_change_of_anything_it_was_made_from_is_noticed(
     assert is_unchanged(capsys)
     change()
     message = f"topology.apc: E605 model is out of date: {shown} has changed."
-    assert told(apc.load, MODEL) == [f"{message} Try: apc compile topology.yaml"]
+    assert messages_of(apc.load, MODEL) == [f"{message} Try: apc compile topology.yaml"]
     assert not is_unchanged(capsys)
     assert apc.load(MODEL).peers == len(TABLE.read_text(encoding="utf-8").splitlines()) - 1
     assert is_unchanged(capsys)
@@ -110,7 +110,7 @@ def test_a_change_of_the_library_is_noticed(
     write("other.yaml", "connector: Flange\n")
     library = {**cache.builtin_files(), "Flange": Path("other.yaml").resolve()}
     monkeypatch.setattr(cache, "builtin_files", lambda: library)
-    assert "model is out of date: the library's Flange has changed" in told(apc.load, MODEL)[0]
+    assert "model is out of date: the library's Flange has changed" in messages_of(apc.load, MODEL)[0]
     assert not is_unchanged(capsys)
 
 
@@ -172,12 +172,12 @@ def test_what_is_no_file_is_not_read_and_is_a_change(name: str, put: Callable[[s
 
 
 def re_load() -> str:
-    return told(apc.load, MODEL)[0].split()[1]
+    return messages_of(apc.load, MODEL)[0].split()[1]
 
 
 def test_a_folder_that_grew_is_not_walked_to_its_end_and_is_a_change(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(files, "MOST_ENTRIES", 0)
-    assert "E605 model is out of date: parts/ has changed" in told(apc.load, MODEL)[0]
+    assert "E605 model is out of date: parts/ has changed" in messages_of(apc.load, MODEL)[0]
 
 
 def test_what_could_not_be_read_either_time_is_no_proof() -> None:

@@ -22,7 +22,7 @@ from apc.compiler import files
 from apc.compiler.errors import ApcError
 from apc.compiler.files import RefusedError, begin_file, finish_file, read_file, write_file, write_texts
 from tests.commands import Cli, folder, write
-from tests.topologies import AVERAGE, replaced, told
+from tests.topologies import AVERAGE, messages_of, replaced
 
 FIFO = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="there are no named pipes")
 OUT = Path("r.csv")
@@ -109,7 +109,7 @@ def test_of_a_failure_nothing_is_seen(fault: BaseException) -> None:
 )
 def test_where_nothing_can_be_written_is_told(name: str, why: str) -> None:
     Path("round").symlink_to("round")
-    (message,) = told(write_file, Path(name), fill(""))
+    (message,) = messages_of(write_file, Path(name), fill(""))
     assert f": E601 can't be written: {why}" in message
 
 
@@ -486,7 +486,7 @@ def test_what_a_command_reads_it_never_replaces(inputs: Cli, line: str, message:
     assert inputs(line) == (1, "", f"{message}\n")
     assert (Path("users.csv").read_text(), Path("topology.txt").read_text()) == (TABLE, AVERAGE)
     over = {"contact.stiffness": "1 N/m:2 N/m:2"}
-    assert told(lambda: apc.sweep("topology.yaml", over, out="users.csv")) == [
+    assert messages_of(lambda: apc.sweep("topology.yaml", over, out="users.csv")) == [
         'users.csv: E616 out would replace an input file. Try: out="users-result.csv"'
     ]
 

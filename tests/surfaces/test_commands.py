@@ -76,11 +76,11 @@ def test_check_builds_nothing_and_reports_every_mistake(topology: Cli) -> None:
 def test_json_is_one_document_and_nothing_else(topology: Cli) -> None:
     ran = topology("analyze --json")
     assert (ran.code, ran.err) == (0, "")
-    told = json.loads(ran.out)
-    assert (told["topology"], told["peers"], told["frame_s"]) == ("three-users-average", 3, 0.008)
-    assert (told["stable"], told["rigid_modes"]) == (True, 1)
-    assert 0 < told["spectral_radius_error"] < 1e-9
-    assert set(told["modes"][0]) >= {
+    reported = json.loads(ran.out)
+    assert (reported["topology"], reported["peers"], reported["frame_s"]) == ("three-users-average", 3, 0.008)
+    assert (reported["stable"], reported["rigid_modes"]) == (True, 1)
+    assert 0 < reported["spectral_radius_error"] < 1e-9
+    assert set(reported["modes"][0]) >= {
         *("eigenvalue", "magnitude", "multiplicity", "frequency_hz", "damping_ratio", "family"),
         "participation",
     }
@@ -187,17 +187,17 @@ def test_the_commands_are_listed_once_by_section_with_complete_sentences(cli: Cl
 @pytest.mark.few(1)
 @pytest.mark.skipif(sys.platform == "win32", reason="a shell of another kind")
 @pytest.mark.parametrize(
-    ("line", "code", "told"),
+    ("line", "code", "reported"),
     [
         ("{apc} schema | head -c 1 >/dev/null; exit ${{PIPESTATUS[0]}}", 0, ""),
         ("{apc} schema >&-", 1, "stdout is closed"),
     ],
 )
-def test_an_output_that_is_closed_is_no_bug(line: str, code: int, told: str) -> None:
+def test_an_output_that_is_closed_is_no_bug(line: str, code: int, reported: str) -> None:
     command = line.format(apc=f"{sys.executable} -m apc")
     ran = subprocess.run(["bash", "-c", command], capture_output=True, text=True, check=False)
     assert ran.returncode == code, ran.stderr
-    assert told in ran.stderr and "bug" not in ran.stderr
+    assert reported in ran.stderr and "bug" not in ran.stderr
 
 
 # ---- numbers ----

@@ -136,29 +136,31 @@ def test_sections_tell_what_the_api_tells(tmp_path: Path) -> None:
     overrides = tuple(overrides_of(sliders, places))
     setting = {one.free.label: f"{float(one.value) * 1e3!r} ms" for one in overrides}
 
-    def told(section: str, requested: Any = None) -> dict[str, Any]:
+    def report_of(section: str, requested: Any = None) -> dict[str, Any]:
         answer = compute(model, Task(section, overrides, requested)).result
         assert answer is not None
         return answer
 
     analysis, whole = apc.analyze(system, params=setting), apc.region(system, params=setting)
-    verdict, transparency = told("verdict"), told("transparency")
+    verdict, transparency = report_of("verdict"), report_of("transparency")
     assert verdict["radius"] == analysis.spectral_radius and verdict["text"] == str(analysis)
-    region = told("region", (*axes_of(sliders, places, (0, 1)), "nominal"))
+    region = report_of("region", (*axes_of(sliders, places, (0, 1)), "nominal"))
     assert region["share"] == pytest.approx(whole.stable_area / (5000 * 1500), rel=1e-4)  # drawn to 1e-5
     used = apc.transparency(system, transparency["frequency"], params=setting)
     assert np.array_equal(transparency["magnitude"], np.abs(used.impedance))
     best = apc.tune(
         system, {"contact.stiffness": "0 N/m:5000 N/m"}, maximize="contact.stiffness", params=setting
     )
-    assert told("tune", (("contact.stiffness=0 N/m:5000 N/m",), "contact.stiffness"))["text"] == str(best)
+    assert report_of("tune", (("contact.stiffness=0 N/m:5000 N/m",), "contact.stiffness"))["text"] == str(
+        best
+    )
 
 
 def test_a_section_that_a_topology_has_nothing_for_says_so(tmp_path: Path) -> None:
     model = model_bytes(compiled(AVERAGE, tmp_path))
-    told = compute(model, Task("network", ()))
-    assert told.result is None
-    assert "no link here loses packets" in told.why and "loss: 1 %" in told.why
+    reported = compute(model, Task("network", ()))
+    assert reported.result is None
+    assert "no link here loses packets" in reported.why and "loss: 1 %" in reported.why
     unstable = (parse_override(compiled(AVERAGE, tmp_path), "contact.stiffness=5000 N/m"),)
     why = compute(model, Task("transparency", unstable)).why
     assert "unstable" in why and "--" not in why  # a page has no command line
@@ -179,8 +181,8 @@ def test_what_goes_wrong_in_a_section_is_told_there(tmp_path: Path, monkeypatch:
         raise ValueError("shapes differ")
 
     monkeypatch.setitem(sections.SECTIONS, "transparency", broken)
-    told = compute(model_bytes(compiled(AVERAGE, tmp_path)), Task("transparency", ()))
-    assert told.why == "Internal error of apc: ValueError: shapes differ"
+    reported = compute(model_bytes(compiled(AVERAGE, tmp_path)), Task("transparency", ()))
+    assert reported.why == "Internal error of apc: ValueError: shapes differ"
 
 
 # Who computes it.
@@ -208,7 +210,9 @@ def at_once(call: Callable[[], None], seconds: float) -> None:
 
 def test_an_old_answer_never_takes_the_place_of_a_newer_one() -> None:
     held, shown = Held(), []
-    desk = SectionWorker(b"", ("a", "b"), at_once, lambda section, told: shown.append((section, told.result)))
+    desk = SectionWorker(
+        b"", ("a", "b"), at_once, lambda section, reported: shown.append((section, reported.result))
+    )
     desk.workers = Workers(held.submit, 1, lambda _: None)
     assert desk.submit(Task("b", (), 1)) and not desk.submit(Task("b", (), 1))
     for number in (2, 3, 4):  # while it computes, the newest waits in the place of those before it
@@ -490,12 +494,12 @@ def test_figures_are_hidden_until_their_result_is_there() -> None:
 
 def test_peaks_of_an_impedance_are_resolved_and_inside_the_axes(tmp_path: Path) -> None:
     system = compiled(AVERAGE, tmp_path)
-    told = compute(model_bytes(system), Task("transparency", (), "")).result
-    assert told is not None
+    reported = compute(model_bytes(system), Task("transparency", (), "")).result
+    assert reported is not None
     dense = np.abs(apc.transparency(system, np.geomspace(0.1, 60, 1500)).impedance)
-    assert told["magnitude"].max() > 0.99 * dense.max()
+    assert reported["magnitude"].max() > 0.99 * dense.max()
     figure = TransparencyFigure()
-    figure.show(told)
+    figure.show(reported)
     low, high = figure.plot.y_range.start, figure.plot.y_range.end
     decades = np.log10(high / low)
     assert figure.magnitudes.ticks == [2, 5, 10, 20, 50] and figure.frequencies.ticks == [0.1, 1, 10]
@@ -517,8 +521,8 @@ def test_an_unreliable_topology_opens_with_mean_square_stability(tmp_path: Path)
     opened = tab_of(compiled(LOSSY, tmp_path))
     assert opened.criterion_select.value.startswith("mean-square")
     verdict = next(task for task in Asked.requested if task.section == "verdict")
-    told = compute(model_bytes(opened.system), verdict).result
-    assert told is not None and told["measure"] == "second-moment growth"
+    reported = compute(model_bytes(opened.system), verdict).result
+    assert reported is not None and reported["measure"] == "second-moment growth"
     assert tab_of(compiled(AVERAGE, tmp_path)).criterion_select.value.startswith("nominal")
 
 
@@ -567,8 +571,8 @@ def tapped(page: TopologyTab, x: Any, y: Any) -> None:
     """Have the browser say that the region was clicked."""
     values = [["model", {"id": page.region.plot.id}], ["x", x], ["y", y]]
     tap = {"type": "event", "name": "tap", "values": {"type": "map", "entries": values}}
-    told = {"kind": "MessageSent", "msg_type": "bokeh_event", "msg_data": tap}
-    page.document.apply_json_patch({"events": [told]})
+    reported = {"kind": "MessageSent", "msg_type": "bokeh_event", "msg_data": tap}
+    page.document.apply_json_patch({"events": [reported]})
 
 
 @pytest.mark.whole

@@ -249,9 +249,14 @@ def test_a_picture_is_drawn_without_the_settings_in_the_working_folder(
     else:
         (tmp_path / "matplotlibrc").write_text(settings, errors="surrogateescape")
     made = "from apc.__main__ import run; failed = run(['show', 'topology.yaml', '--out', 'topology.png'])"
-    told = f"{made}\nimport matplotlib; print(failed, matplotlib.rcParams['animation.ffmpeg_path'])"
+    reported = f"{made}\nimport matplotlib; print(failed, matplotlib.rcParams['animation.ffmpeg_path'])"
     ran = subprocess.run(
-        [sys.executable, "-c", told], cwd=tmp_path, capture_output=True, text=True, check=False, timeout=60
+        [sys.executable, "-c", reported],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
     )
     assert ran.stdout.splitlines()[-1:] == ["0 ffmpeg"], ran.stderr
     assert (tmp_path / "topology.png").is_file()

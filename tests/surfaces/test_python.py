@@ -15,7 +15,7 @@ import pytest
 
 import apc
 from apc.support.arguments import _fits, _hints
-from tests.topologies import AVERAGE, TOPOLOGIES, compiled, replaced, told
+from tests.topologies import AVERAGE, TOPOLOGIES, compiled, messages_of, replaced
 
 PATH = TOPOLOGIES / "three-users-average.yaml"
 
@@ -81,21 +81,21 @@ def test_results_are_frozen_and_plain_data(model: apc.Model) -> None:
 
 
 def test_a_list_of_no_topologies_is_refused_and_one_topology_needs_no_list(model: apc.Model) -> None:
-    assert told(apc.compare, []) == [
+    assert messages_of(apc.compare, []) == [
         'compare: E610 no topology given. Try: apc.compare(["average.yaml", "mesh.yaml"])'
     ]
-    assert told(apc.report, []) == [
+    assert messages_of(apc.report, []) == [
         'report: E610 no topology given. Try: apc.report(["average.yaml", "mesh.yaml"])'
     ]
     assert [scheme.topology for scheme in apc.compare(str(PATH)).schemes] == ["three-users-average"]
-    assert told(apc.robust_stability, model, {}) == [
+    assert messages_of(apc.robust_stability, model, {}) == [
         "box: E830 the box has no parameter. Try: device.damping=0 N*s/m:10 N*s/m"
     ]
 
 
 def test_what_tells_of_texts_refuses_a_compiled_model(model: apc.Model) -> None:
     for function, given in ((apc.report, model), (apc.report, [model]), (apc.show, model)):
-        [mistake] = told(function, given)
+        [mistake] = messages_of(function, given)
         assert mistake.startswith("three-users-average.apc: E615 file is a compiled model")
 
 

@@ -57,12 +57,12 @@ def test_all_peers_of_a_topology_do_what_is_simulated_with_the_packets_they_hear
     )
     Path("three.yaml").write_text(text, encoding="utf-8")
     assert run(["run", "--duration", "1 s", "--emulate", "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert told["why_not"] == ""
-    assert max(far for far, _ in told["differences"].values()) <= 1e-9
-    assert told["differences"]["N"][1] > 0.1
-    assert len(told["arcs"]) == 2
-    for arc in told["arcs"]:
+    reported = json.loads(capsys.readouterr().out)
+    assert reported["why_not"] == ""
+    assert max(far for far, _ in reported["differences"].values()) <= 1e-9
+    assert reported["differences"]["N"][1] > 0.1
+    assert len(reported["arcs"]) == 2
+    for arc in reported["arcs"]:
         assert 0.01 < arc["came"]["lost"]["share"] < 0.45  # of 125, of which 20 % are lost: 6 deviations
         assert arc["came"]["shortest"] >= 0.008
     assert [one.name for one in read_run(Path("three.run")).peers] == ["user[1]", "user[2]"]
@@ -77,11 +77,11 @@ def test_all_peers_of_a_topology_do_what_is_simulated_with_the_packets_they_hear
 
 def test_a_device_outside_is_measured_and_pushed(monkeypatch: pytest.MonkeyPatch) -> None:
     """A wall of clay at 2 mm: its position is what is recorded, its force what the contact's spring says."""
-    told: dict[int, float] = {}
+    reported: dict[int, float] = {}
 
     def device(time: float, force: float | None) -> float:
         if force is not None:
-            told[round(time * 1000)] = force
+            reported[round(time * 1000)] = force
         return 0.002
 
     wire = Wire(monkeypatch)
@@ -98,7 +98,7 @@ def test_a_device_outside_is_measured_and_pushed(monkeypatch: pytest.MonkeyPatch
     assert np.ptp(acting) > 1e-3
     # What acts from tick k on is recorded at tick k + 1, as it was just before that.
     for tick in range(len(acting) - 1):
-        assert told[tick] == pytest.approx(-acting[tick + 1], abs=1e-12)
+        assert reported[tick] == pytest.approx(-acting[tick + 1], abs=1e-12)
 
 
 @pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
@@ -246,10 +246,10 @@ def test_ctrl_c_ends_a_peer_and_what_it_did_is_kept(tmp_path: Path) -> None:
     assert "stopped" in waiting.communicate(timeout=240)[1]
     assert waiting.returncode == 130
     assert not (tmp_path / "no.run").exists()
-    told = playing.communicate(timeout=240)
+    reported = playing.communicate(timeout=240)
     if playing.returncode != 130:  # the topology had begun
-        assert playing.returncode == 0, told[1]
-        assert "stopped before the end" in told[0]
+        assert playing.returncode == 0, reported[1]
+        assert "stopped before the end" in reported[0]
         assert all(one.stopped for one in read_run(tmp_path / "all.run").peers)
 
 

@@ -183,7 +183,7 @@ def test_a_report_is_computed_anew_from_itself_alone(cli: Cli) -> None:
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "told"),
+    ("old", "new", "reported"),
     [
         ({"a": 1.0, "error": 1e-9}, {"a": 1.0 + 1e-8, "error": 1e-3}, []),
         ({"a": 1.0, "a_error": 0.2}, {"a": 1.1, "a_error": None}, []),
@@ -194,9 +194,9 @@ def test_a_report_is_computed_anew_from_itself_alone(cli: Cli) -> None:
     ],
 )
 def test_differences_are_by_more_than_roundings_and_their_own_errors(
-    old: object, new: object, told: list[str]
+    old: object, new: object, reported: list[str]
 ) -> None:
-    assert [*differences(old, new)] == told
+    assert [*differences(old, new)] == reported
 
 
 def in_figure(page: str, old: str, new: str) -> str:
@@ -355,7 +355,7 @@ HUGE = [{"key": "verdict", "refused": "", "results": [{"spectral_radius": 10**40
 
 
 @pytest.mark.parametrize(
-    ("page", "told"),
+    ("page", "reported"),
     [
         (f'{SCRIPT}{{"versions": {{}}, "topologies": []}}</script>', "holds no topology"),
         (made_up(file=""), "holds no text of ''"),
@@ -369,10 +369,10 @@ HUGE = [{"key": "verdict", "refused": "", "results": [{"spectral_radius": 10**40
         (made_up(sections=HUGE), "is no report that apc has written, or is damaged"),
     ],
 )
-def test_what_another_program_put_into_a_page_is_refused(page: str, told: str, cli: Cli) -> None:
+def test_what_another_program_put_into_a_page_is_refused(page: str, reported: str, cli: Cli) -> None:
     write("r.html", page)
     ran = cli("report --check r.html")
-    assert ran.code == 1 and f"E990 {told}" in ran.err
+    assert ran.code == 1 and f"E990 {reported}" in ran.err
     assert folder() == ["r.html"]
 
 

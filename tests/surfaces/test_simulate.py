@@ -43,11 +43,15 @@ def test_rows_and_picture_are_written_and_named(moved: Cli) -> None:
 
 def test_json_is_one_document_with_what_made_it(moved: Cli) -> None:
     ran = moved("simulate --json --duration 0.1s --set 'contact.stiffness=800 N/m' --no-jit")
-    told = json.loads(ran.out)
-    assert (told["topology"], told["rows"], told["diverged"]) == ("three-users-average", 101, None)
-    assert told["provenance"]["parameters"]["contact.stiffness"]["value"] == 800
-    assert told["provenance"]["duration_s"] == "1/10"
-    assert told["signals"][0].keys() >= {"name", "unit", "first", "last", "low", "high"}
+    reported = json.loads(ran.out)
+    assert (reported["topology"], reported["rows"], reported["diverged"]) == (
+        "three-users-average",
+        101,
+        None,
+    )
+    assert reported["provenance"]["parameters"]["contact.stiffness"]["value"] == 800
+    assert reported["provenance"]["duration_s"] == "1/10"
+    assert reported["signals"][0].keys() >= {"name", "unit", "first", "last", "low", "high"}
 
 
 @pytest.mark.parametrize(
@@ -110,7 +114,7 @@ def test_the_error_and_the_method_are_told_if_asked_for(moved: Cli) -> None:
     assert "  method              semi-implicit:0.5 ms\n" in out
     assert "(half the step, semi-implicit:0.25 ms)" in " ".join(out.split())
     assert all(len(line) <= 80 for line in out.splitlines())
-    told = json.loads(moved("simulate --duration 0.1s --error --method rk4:1ms --json").out)
-    assert told["provenance"]["method"] == "rk4:1 ms"
-    assert told["error_estimate"]["kind"] == "method"
-    assert len(told["error_estimate"]["signals"]) == len(told["signals"])
+    reported = json.loads(moved("simulate --duration 0.1s --error --method rk4:1ms --json").out)
+    assert reported["provenance"]["method"] == "rk4:1 ms"
+    assert reported["error_estimate"]["kind"] == "method"
+    assert len(reported["error_estimate"]["signals"]) == len(reported["signals"])

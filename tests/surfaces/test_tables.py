@@ -22,7 +22,7 @@ from apc.support.tables import (
     read_table,
     write_table,
 )
-from tests.topologies import told
+from tests.topologies import messages_of
 
 COLUMNS = (TableColumn("x", "m"), TableColumn("verdict", kind="text"), TableColumn("modes", kind="count"))
 ROWS = ((0.1 + 0.2, "stable, or so", 1), (5e-324, 'say "no"', None), (None, None, 3), (-1e300, "ρ\nσ", 4))
@@ -78,11 +78,11 @@ def test_a_missing_pyarrow_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
         raise ImportError(name)
 
     monkeypatch.setattr(importlib, "import_module", missing)
-    assert told(check_table_path, Path("t.parquet"), "--out") == [
+    assert messages_of(check_table_path, Path("t.parquet"), "--out") == [
         "t.parquet: E887 is a Parquet file, which needs pyarrow; without it, the name can end in .csv. "
         "Try: pip install '.[data]'  # in the folder of apc's own pyproject.toml"
     ]
-    assert told(check_table_path, Path("t.csv"), "--out") == []
+    assert messages_of(check_table_path, Path("t.csv"), "--out") == []
 
 
 def test_room_that_is_kept_is_in_the_file_and_may_be_written_over(tmp_path: Path) -> None:

@@ -68,8 +68,8 @@ class Wire:
         ready = bool(self.coming) and self.coming[0][0] <= end
         if self.endless is None:
             self.time = max(self.time, min(self.coming[0][0], end)) if ready else end
-        told = [one for one in watched if one is not self and one.poll()]
-        return told + ([self] if ready or self.endless else []), [], []
+        reported = [one for one in watched if one is not self and one.poll()]
+        return reported + ([self] if ready or self.endless else []), [], []
 
 
 class Other:

@@ -32,8 +32,8 @@ def test_an_exact_topology_is_off_by_roundings_and_the_estimate_is_no_less() -> 
     followed = exact_course(system, Fraction(1))
     assert not isinstance(followed, str), followed
     made = np.abs(found.values[:, :2] - followed[1]).max(axis=0)
-    told = np.array([one.error for one in found.error.signals[:2]])
-    assert (made <= told).all() and (told <= 100 * made).all()
+    reported = np.array([one.error for one in found.error.signals[:2]])
+    assert (made <= reported).all() and (reported <= 100 * made).all()
     assert error_text(found.error).startswith("rounding only, about ")
 
 
@@ -46,8 +46,8 @@ def test_the_estimate_of_a_linear_topology_is_its_distance_from_the_exact_motion
     found = simulate(system, duration=duration, method=parse_method(method), error=True, jit=False)
     assert found.error is not None
     made = np.abs(found.values - exact.values).max(axis=0)
-    told = np.array([one.error for one in found.error.signals])
-    assert told == pytest.approx(made, rel=0.5, abs=1e-14)
+    reported = np.array([one.error for one in found.error.signals])
+    assert reported == pytest.approx(made, rel=0.5, abs=1e-14)
 
 
 def test_the_estimate_of_a_contact_is_its_distance_from_a_far_tighter_run() -> None:
@@ -58,9 +58,9 @@ def test_the_estimate_of_a_contact_is_its_distance_from_a_far_tighter_run() -> N
         found = simulate(system, duration=length, method=parse_method(method), error=True, jit=False)
         assert found.error is not None
         made = np.abs(found.values - best).max(axis=0)
-        told = np.array([one.error for one in found.error.signals])
-        assert (told > 0.3 * made).all()
-        assert (told < 5 * made).all()
+        reported = np.array([one.error for one in found.error.signals])
+        assert (reported > 0.3 * made).all()
+        assert (reported < 5 * made).all()
     document = found.to_dict()["error_estimate"]
     assert document["compared_with"] == "half the step, rk4:0.025 ms"
     assert document["signals"][0].keys() == {"name", "unit", "error", "time_s", "range"}

@@ -120,11 +120,11 @@ def reported_by(simulation: Simulation, path: Path) -> str:
 
 def check_kept(path: Path, message: str) -> int:
     """Check that a file holds what a message says; return how many rows."""
-    told = re.search(r"E879 holds the first (\d+) rows only, up to ([\d.e-]+) s: \w+", message)
-    assert told, message
+    reported = re.search(r"E879 holds the first (\d+) rows only, up to ([\d.e-]+) s: \w+", message)
+    assert reported, message
     time, values, names, provenance = read(path)
-    rows = int(told[1])
-    assert len(time) == rows and f"{time[-1]:.9g}" == told[2]
+    rows = int(reported[1])
+    assert len(time) == rows and f"{time[-1]:.9g}" == reported[2]
     assert (time == WHOLE.time[:rows]).all() and (values == WHOLE.values[:rows]).all()
     assert len(names) == len(WHOLE.signals) and provenance["topology"] == "three-users-average"
     return rows

@@ -151,9 +151,12 @@ def test_a_run_in_real_time_does_what_is_simulated(
     )
     Path("relay.yaml").write_text(text, encoding="utf-8")
     assert run(["run", "--duration", "1 s", "--emulate", "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert told["why_not"] == ""
-    assert told["differences"]["N"][1] > 1e-3 and max(far for far, _ in told["differences"].values()) <= 1e-9
+    reported = json.loads(capsys.readouterr().out)
+    assert reported["why_not"] == ""
+    assert (
+        reported["differences"]["N"][1] > 1e-3
+        and max(far for far, _ in reported["differences"].values()) <= 1e-9
+    )
 
 
 PAIRS = (

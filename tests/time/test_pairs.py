@@ -154,7 +154,7 @@ def by_hand(force: Force, arcs: ArcWeights, late: Late, *, zero: bool = False) -
         return [-f], [f, memory[1] + 1], []
 
     receives = [[j for j in range(4) if (j, i) in arcs] for i in range(4)]
-    scheme = ByHand([[(0.1, 5.0, 0.0)]] * 4, receives, law, told=0, memory=2, late=late, zero=zero)
+    scheme = ByHand([[(0.1, 5.0, 0.0)]] * 4, receives, law, first_sent=0, memory=2, late=late, zero=zero)
     rows = itertools.islice(course(scheme, [[(x, 0.0)] for x in X], [[0.0, 0]] * 4), int(DURATION / MS) + 1)
     return np.array([[one for motion in now.motion for body in motion for one in body] for now in rows])
 

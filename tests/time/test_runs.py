@@ -15,7 +15,7 @@ from apc.simulation.settings import DEFAULT, Method, Settings, check_step, parse
 from apc.simulation.simulation import MOST_ROWS, check_length, prepare, size_note
 from apc.simulation.trajectory import Trajectory, simulate
 from tests.sites import edged
-from tests.topologies import AVERAGE, ONE_MASS, TOPOLOGIES, compiled, replaced, told
+from tests.topologies import AVERAGE, ONE_MASS, TOPOLOGIES, compiled, messages_of, replaced
 
 MS = Fraction(1, 1000)
 AVERAGE_RUN, MESH_RUN = (
@@ -282,16 +282,16 @@ def test_a_method_is_read_with_its_step_exact_or_refused_in_one_line(text: str, 
     if isinstance(meant, Method):
         assert parse_method(text) == meant
     else:
-        assert told(parse_method, text) == [f"--method: {meant}"]
+        assert messages_of(parse_method, text) == [f"--method: {meant}"]
 
 
 def test_a_step_that_the_topology_has_no_room_for_is_refused() -> None:
     system = compiled(AVERAGE)
-    assert told(check_step, system, Method("rk4", step=2 * MS), MS, MS) == [
+    assert messages_of(check_step, system, Method("rk4", step=2 * MS), MS, MS) == [
         "topology.yaml: E913 step of rk4: expected at most the period of the fastest clock, 1 ms, "
         "got 2 ms. Try: --method rk4:1ms"
     ]
-    [printed] = told(check_step, system, Method("rk4", step=MS / 10**7), MS, MS)
+    [printed] = messages_of(check_step, system, Method("rk4", step=MS / 10**7), MS, MS)
     assert printed.startswith("topology.yaml: E913 step of rk4: expected at least 1e-06 ms,")
     for method in (Method("rk4", step=MS), DEFAULT):
         check_step(system, method, MS, MS)
@@ -299,7 +299,7 @@ def test_a_step_that_the_topology_has_no_room_for_is_refused() -> None:
 
 def test_a_run_is_as_long_as_is_said_and_no_longer_than_anyone_waits() -> None:
     system = compiled(AVERAGE)
-    assert told(simulate, system) == [
+    assert messages_of(simulate, system) == [
         "topology.yaml: E877 the topology has no duration. Try: experiment: {duration: 3 s}, "
         'or --duration "3 s"'
     ]

@@ -18,7 +18,7 @@ from apc.studies.resumable_sweep import sweep
 from apc.support import processes
 from apc.support.processes import Patience
 from tests.sweeping import CHEAP, parts
-from tests.topologies import compiled, told
+from tests.topologies import compiled, messages_of
 
 distributed = pytest.importorskip("distributed", reason="Dask's distributed is not installed: '.[cluster]'")
 
@@ -90,7 +90,7 @@ def test_an_address_at_which_no_scheduler_can_be_is_told(
     where: str, message: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sweep_cluster, "PATIENCE_S", 0.5)
-    (got,) = told(lambda: sweep(MODEL, OVER, cluster=where))
+    (got,) = messages_of(lambda: sweep(MODEL, OVER, cluster=where))
     assert got.startswith(message)
 
 
@@ -100,7 +100,7 @@ def test_a_cluster_that_is_not_there_is_told_soon(tmp_path: Path, monkeypatch: p
     with socket.socket() as used:  # a port that nobody listens at
         used.bind(("127.0.0.1", 0))
         where = f"tcp://127.0.0.1:{used.getsockname()[1]}"
-        assert told(lambda: sweep(MODEL, OVER, out=tmp_path / "r.csv", cluster=where)) == [
+        assert messages_of(lambda: sweep(MODEL, OVER, out=tmp_path / "r.csv", cluster=where)) == [
             f"{where}: E888 no answer of a Dask scheduler within 0.5 s{FORM}"
         ]
     assert list(tmp_path.iterdir()) == []
@@ -108,7 +108,7 @@ def test_a_cluster_that_is_not_there_is_told_soon(tmp_path: Path, monkeypatch: p
 
 def test_a_missing_distributed_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    assert told(lambda: sweep(MODEL, OVER, cluster="tcp://host:1")) == [
+    assert messages_of(lambda: sweep(MODEL, OVER, cluster="tcp://host:1")) == [
         "tcp://host:1: E888 a cluster requires Dask's distributed on this computer and on the workers. "
         "Try: pip install '.[cluster]'  # in the folder of apc's own pyproject.toml"
     ]
@@ -121,7 +121,7 @@ def test_a_cluster_without_workers_is_told(monkeypatch: pytest.MonkeyPatch) -> N
 
     monkeypatch.setattr(distributed.Client, "wait_for_workers", none_comes)
     with distributed.LocalCluster(n_workers=0, **ANYWHERE) as empty:
-        assert told(lambda: sweep(MODEL, OVER, cluster=empty.scheduler_address)) == [
+        assert messages_of(lambda: sweep(MODEL, OVER, cluster=empty.scheduler_address)) == [
             f"{empty.scheduler_address}: E888 the cluster has no workers."
         ]
 
@@ -161,7 +161,9 @@ def test_a_frozen_worker_is_waited_for_aloud_and_only_so_long(monkeypatch: pytes
         os.kill(worker, signal.SIGSTOP)
         try:
             waiting = Patience(0.3, received.append)
-            (message,) = told(lambda: sweep(MODEL, OVER, cluster=frozen.scheduler_address, patience=waiting))
+            (message,) = messages_of(
+                lambda: sweep(MODEL, OVER, cluster=frozen.scheduler_address, patience=waiting)
+            )
         finally:
             os.kill(worker, signal.SIGCONT)
     waited = "no result from the worker processes for {} s; still waiting"

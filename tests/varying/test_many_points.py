@@ -17,7 +17,7 @@ from apc.compiler.errors import ApcError
 from apc.spectrum.ball_arithmetic import precision
 from apc.studies.batch_analysis import Analyses
 from tests.paper_limit import BITS, truth
-from tests.topologies import AVERAGE, MESH, OSCILLATOR, ROOT, TOPOLOGIES, compiled, replaced, told
+from tests.topologies import AVERAGE, MESH, OSCILLATOR, ROOT, TOPOLOGIES, compiled, messages_of, replaced
 
 
 def as_alone(system: Model, given: Mapping[str, Any], points: Any = None) -> Analyses:
@@ -210,5 +210,5 @@ def test_the_result_is_a_table_a_text_and_plain_data() -> None:
     ],
 )
 def test_values_that_are_none_are_told(values: dict[str, Any], message: str) -> None:
-    (got,) = told(apc.analyze_many, compiled(AVERAGE), values)
+    (got,) = messages_of(apc.analyze_many, compiled(AVERAGE), values)
     assert got.startswith(f"analyze_many: {message}")

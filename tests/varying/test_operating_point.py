@@ -14,7 +14,7 @@ from scipy.optimize import brentq
 import apc
 from apc.compiler.compiled import Model
 from tests.commands import Cli, write
-from tests.topologies import AVERAGE, ONE_MASS, TOPOLOGIES, compiled, library, replaced, told
+from tests.topologies import AVERAGE, ONE_MASS, TOPOLOGIES, compiled, library, messages_of, replaced
 
 EXPERIMENT = compiled((TOPOLOGIES / "experiment-average.yaml").read_text(encoding="utf-8"))
 
@@ -299,14 +299,14 @@ def test_a_direction_without_stiffness_keeps_its_start() -> None:
 
 def test_an_equilibrium_that_does_not_exist_is_refused() -> None:
     free = WALL.format(force=-2).replace("stiffness: 100 N/m", "stiffness: 0 N/m")
-    (message,) = told(apc.operating_point, compiled(free.replace("150 N/m", "0 N/m")))
+    (message,) = messages_of(apc.operating_point, compiled(free.replace("150 N/m", "0 N/m")))
     assert "E847 no equilibrium: 2 N acts on device, and nothing balances it." in message
     moving = (
         WALL.format(force=1)
         .replace("ConstantForce", "SineForce")
         .replace("force: 1 N", "force: 1 N, frequency: 2 Hz")
     )
-    (message,) = told(apc.operating_point, compiled(moving))
+    (message,) = messages_of(apc.operating_point, compiled(moving))
     assert "E849 a force on device depends on time, so there is no equilibrium." in message
 
 
@@ -336,7 +336,7 @@ couplers: {aging: {type: Aging, object: cube, stiffness: 100 N/m, period: 0.1 s,
 links: {lan: {clock: network, delay: 4 ms}}
 hands: {push: {type: ConstantForce, flange: cube, force: 1 N}}
 """
-    (message,) = told(apc.operating_point, compiled(text, library(tmp_path, part)))
+    (message,) = messages_of(apc.operating_point, compiled(text, library(tmp_path, part)))
     assert "E849 a force depends on the ages of packets, so there is no equilibrium." in message
 
 

@@ -133,12 +133,12 @@ def test_equal_groups_have_an_active_set_and_no_single_gradient() -> None:
     """The difference modes of three equal users are two; changing one user alone moves them apart."""
     found = apc.sensitivities(compiled(EQUAL))
     assert len(found.active) == 2 and "have the largest magnitude" in found.note
-    told = sorted(row.derivative for row in found.rows if row.parameter == "one.contact.stiffness")
+    reported = sorted(row.derivative for row in found.rows if row.parameter == "one.contact.stiffness")
     low, here, high = (
         apc.analyze(compiled(EQUAL), params={"one.contact.stiffness": f"{1000 + side} N/m"}).spectral_radius
         for side in (-1e-3, 0, 1e-3)
     )
-    assert [(here - low) / 1e-3, (high - here) / 1e-3] == pytest.approx(told, rel=1e-4, abs=1e-9)
+    assert [(here - low) / 1e-3, (high - here) / 1e-3] == pytest.approx(reported, rel=1e-4, abs=1e-9)
 
 
 def test_a_damping_of_nothing_has_the_derivative_of_what_it_adds_up_with() -> None:

@@ -25,7 +25,7 @@ from apc.__main__ import run
 from apc.compiler import signing
 from apc.studies.resumable_sweep import Sweep, sweep
 from tests.sweeping import CHEAP, alive, children, parts, start, start_waiting, wait_for_parts
-from tests.topologies import AVERAGE, ONE_MASS, TOPOLOGIES, compiled, told
+from tests.topologies import AVERAGE, ONE_MASS, TOPOLOGIES, compiled, messages_of
 
 WALL = compiled(CHEAP)
 MODEL = compiled(ONE_MASS)  # the cheapest of topologies, for what is about files and processes
@@ -249,7 +249,7 @@ MANY = "E883 sweep: expected at most 10,000,000 points, got "
     ],
 )
 def test_a_faulty_axis_gets_one_clear_message(over: dict[str, str], message: str) -> None:
-    (got,) = told(lambda: apc.sweep(compiled(AVERAGE), over))
+    (got,) = messages_of(lambda: apc.sweep(compiled(AVERAGE), over))
     assert got == f"sweep: {message}" or (message == MANY and got.startswith(f"sweep: {MANY}"))
 
 
@@ -276,7 +276,7 @@ def test_a_faulty_axis_gets_one_clear_message(over: dict[str, str], message: str
     ],
 )
 def test_a_faulty_wish_is_told_before_anything_is_computed(given: dict[str, object], message: str) -> None:
-    (got,) = told(lambda: sweep(WALL, {"it.stiffness": "1,2 N/m"}, **given))  # type: ignore[arg-type] # faulty
+    (got,) = messages_of(lambda: sweep(WALL, {"it.stiffness": "1,2 N/m"}, **given))  # type: ignore[arg-type] # faulty
     assert got.startswith(message)
 
 
@@ -363,7 +363,7 @@ def test_what_is_no_folder_in_its_place_is_refused_and_stays(tmp_path: Path, pee
     folder = tmp_path / "w.csv.parts"
     (tmp_path / "other").mkdir()
     folder.write_text("thesis", encoding="utf-8") if peer_type == "file" else folder.symlink_to("other")
-    (message,) = told(lambda: small(out=tmp_path / "w.csv", jobs=1))
+    (message,) = messages_of(lambda: small(out=tmp_path / "w.csv", jobs=1))
     assert message.startswith(f"{folder}: E885 already exists and is not a folder")
     assert list((tmp_path / "other").iterdir()) == []
 
@@ -390,7 +390,7 @@ def test_a_full_disk_keeps_what_is_finished(tmp_path: Path, whole: bytes) -> Non
             resource.setrlimit(resource.RLIMIT_FSIZE, (10, before[1]))
 
     try:
-        (message,) = told(lambda: small(out=target, jobs=1, progress=fill))
+        (message,) = messages_of(lambda: small(out=target, jobs=1, progress=fill))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert message.endswith("E601 can't be written: File too large.")

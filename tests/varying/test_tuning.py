@@ -20,7 +20,7 @@ from apc.output.tuning_output import panels_of
 from apc.parameter_values.parameter_names import ParameterRef
 from apc.tuning.specification import TuningSpec, read_tradeoff, read_tuning_spec
 from tests.commands import Cli, write
-from tests.topologies import AVERAGE, MESH, TOPOLOGIES, compiled, replaced, told, wall
+from tests.topologies import AVERAGE, MESH, TOPOLOGIES, compiled, messages_of, replaced, wall
 from tests.varying.test_boxes import with_delays
 
 K, B, CONTACT, MASS = "coordination.stiffness", "coordination.damping", "contact.stiffness", "device.mass"
@@ -271,7 +271,7 @@ def test_a_range_of_a_delay_is_of_constant_delays_and_changing_ones_are_reported
 
 def test_what_cannot_be_asked_is_refused() -> None:
     def refused(free: dict[str, str], **given: object) -> str:
-        return told(lambda: apc.tune(compiled(AVERAGE), free, **({"maximize": K} | given)))[0]  # type: ignore[arg-type]
+        return messages_of(lambda: apc.tune(compiled(AVERAGE), free, **({"maximize": K} | given)))[0]  # type: ignore[arg-type]
 
     good = {K: "10 N/m:5000 N/m"}
     assert refused({}).startswith("--free: E995 no tunable parameter")
@@ -300,14 +300,14 @@ def test_a_name_without_a_range_proposes_a_range_around_its_value(name: str) -> 
     model = compiled(replaced(AVERAGE, ("delay: 8 ms}", "delay: 8 ms, loss: 60 %}")))
     present = {one.name: one.value for one in model.parameters} | {"lan.delay": 0.008}
     problem = f"E830 range of {name}: expected LOW:HIGH or ±PERCENT%, got nothing."
-    [message] = told(lambda: _spec(model, f"{CONTACT}=1 N/m:2 N/m", name))
+    [message] = messages_of(lambda: _spec(model, f"{CONTACT}=1 N/m:2 N/m", name))
     over = _proposed_value(message, f"--over: {problem}", "--over")
     spec = _spec(model, f"{CONTACT}=1 N/m:2 N/m", over)
     [found] = [spec.delay] if spec.delay else spec.box
     assert found.low < found.high
     assert found.low <= present[name.removeprefix("user.")] <= found.high
     if name != "lan.delay":
-        [message] = told(lambda: _spec(model, name))
+        [message] = messages_of(lambda: _spec(model, name))
         free = _proposed_value(message, f"--free: {problem}", "--free")
         assert (free, _spec(model, free).free) == (over, (found,))
 
@@ -315,6 +315,6 @@ def test_a_name_without_a_range_proposes_a_range_around_its_value(name: str) -> 
 @pytest.mark.parametrize("name", ["lan.delay", "user.count"])
 def test_a_delay_or_a_number_of_peers_is_proposed_as_an_operating_condition(name: str) -> None:
     model = compiled(AVERAGE)
-    [message] = told(lambda: _spec(model, name))
+    [message] = messages_of(lambda: _spec(model, name))
     over = _proposed_value(message, f"--free: E995 {name} can't be tuned continuously.", "--over")
     assert _spec(model, f"{K}=1 N/m:2 N/m", over)
