@@ -25,6 +25,7 @@ from apc.spectrum.peer_classes import (
     PeerClass,
     classes_of_peers,
     has_more_states,
+    incomplete_links,
     too_large,
     used_coupling_terms,
 )
@@ -117,12 +118,7 @@ def make_plan(numeric: NumericModel, method: str = "auto") -> AnalysisPlan:
     if populations_allowed and (
         (method == "determinant" and _is_short_and_complete(numeric)) or has_more_states(numeric, FEW_STATES)
     ):
-        coupling_terms = used_coupling_terms(numeric.schedules)
-        sparse = [
-            coupling_term.link
-            for coupling_term in coupling_terms
-            if not exchange.is_complete(coupling_term.link)
-        ]
+        sparse = incomplete_links(numeric.schedules, exchange)
         if not sparse:
             return _plan_populations(numeric)
         if method == "determinant":
@@ -233,11 +229,8 @@ def not_populations(system: Model, jacobians: Sequence[SubsystemJacobians]) -> s
 
 def _is_short_and_complete(numeric: NumericModel) -> bool:
     """Return whether peers differ, all graphs are complete, and at most LONG_LINES packets are in transit."""
-    schedules = numeric.schedules
-    complete = all(
-        numeric.exchange.is_complete(coupling_term.link) for coupling_term in used_coupling_terms(schedules)
-    )
-    short = max(sum(schedule.depths) for schedule in schedules) <= LONG_LINES
+    complete = not incomplete_links(numeric.schedules, numeric.exchange)
+    short = max(sum(schedule.depths) for schedule in numeric.schedules) <= LONG_LINES
     return complete and short and sum(map(len, numeric.numbers.parameters)) > 1
 
 

@@ -40,7 +40,7 @@ from apc.mean_square.second_moment_operator import MomentBlock, Operator
 from apc.network.channel import ChannelLaw, channel_law
 from apc.spectrum.interconnection import Coupling, ModalSystem, without_packets
 from apc.spectrum.modes import complete_degrees, complete_loops, couple, dense_loop, split_exchangeable
-from apc.spectrum.peer_classes import PeerClass, used_coupling_terms
+from apc.spectrum.peer_classes import PeerClass, incomplete_links
 from apc.spectrum.relative_coordinates import Relative
 from apc.spectrum.rigid_modes import find_rigid_modes
 from apc.timing.communication_graph import CommunicationGraph
@@ -472,10 +472,7 @@ def peer_classes(reception: PerTickReception) -> tuple[ModalSystem, Coupling]:
     weight, or from none.
     """
     groups, exchange = reception.groups, reception.exchange
-    if all(
-        exchange.is_complete(coupling_term.link)
-        for coupling_term in used_coupling_terms(group.schedule for group in groups)
-    ):
+    if not incomplete_links((group.schedule for group in groups), exchange):
         degrees = complete_degrees(groups, exchange)
 
         def weight(coupling_term: CouplingTerm, g: int, h: int) -> Fraction:

@@ -34,7 +34,14 @@ from apc.lifting.model_numbers import PeerIndices
 from apc.spectrum.graph_loops import common_graph, graph_loop, graph_scale
 from apc.spectrum.graph_modes import graph_modes
 from apc.spectrum.interconnection import ClosedLoop, Coupling, ModalSystem, close_loop
-from apc.spectrum.peer_classes import PeerClass, group_name, states_of, too_large, used_coupling_terms
+from apc.spectrum.peer_classes import (
+    PeerClass,
+    group_name,
+    incomplete_links,
+    states_of,
+    too_large,
+    used_coupling_terms,
+)
 from apc.support.not_supported import NotSupportedError
 from apc.support.state_limits import MATRIX_STATES
 from apc.timing.communication_graph import CommunicationGraph, check_mean
@@ -84,13 +91,7 @@ def decompose(groups: Sequence[PeerClass], exchange: CommunicationGraph) -> Moda
         As for `split`.
     """
     coupling_terms = used_coupling_terms(group.schedule for group in groups)
-    graphs = list(
-        dict.fromkeys(
-            coupling_term.link
-            for coupling_term in coupling_terms
-            if not exchange.is_complete(coupling_term.link)
-        )
-    )
+    graphs = incomplete_links((group.schedule for group in groups), exchange)
     if not graphs:
         return ModalDecomposition("modes", complete_loops(groups, exchange), ())
     named = " and ".join(f"{link} ({exchange.links[link].graph.shape})" for link in graphs)
@@ -161,8 +162,7 @@ def orthogonal_loops(
     NotSupportedError
         More peers on such a graph than the limit.
     """
-    graphs = {coupling_term.link for coupling_term in used_coupling_terms(group.schedule for group in groups)}
-    graphs = {link for link in graphs if not exchange.is_complete(link)}
+    graphs = incomplete_links((group.schedule for group in groups), exchange)
     if not graphs:
         return complete_loops(groups, exchange)
     count = sum(group.count for group in groups)

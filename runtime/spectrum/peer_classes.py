@@ -2,7 +2,7 @@
 
 Takes: a `NumericModel`.
 Gives: `PeerClass`, `classes_of_peers`, `representatives`, `has_more_states`; `used_coupling_terms`,
-`states_of`; `too_large`; `group_name`, `start_classes`.
+`incomplete_links`, `states_of`; `too_large`; `group_name`, `start_classes`.
 Guarantees: there is one class for each distinct dynamics, found in a time proportional to the number of
 peers; consecutive peers take no memory. A subsystem that is not affine is linearized at its own start values,
 with receptions from the others at theirs. The matrices of a class exist in exact rationals as well, if its
@@ -210,6 +210,12 @@ def used_coupling_terms(schedules: Iterable[Schedule]) -> tuple[CouplingTerm, ..
     return tuple(sorted({received.coupling_term for schedule in schedules for received in schedule.received}))
 
 
+def incomplete_links(schedules: Iterable[Schedule], exchange: CommunicationGraph) -> list[str]:
+    """Return the links with a reception whose graph is not complete, without repetition."""
+    links = dict.fromkeys(coupling_term.link for coupling_term in used_coupling_terms(schedules))
+    return [link for link in links if not exchange.is_complete(link)]
+
+
 def states_of(schedule: Schedule, subsystem: SubsystemJacobians) -> int:
     """Return the number of states that a peer stores from frame to frame."""
     return len(subsystem.peer_type.states) + len(schedule.discrete_states) + sum(schedule.depths)
@@ -304,8 +310,7 @@ def start_classes(numeric: NumericModel) -> list[PeerIndices]:
     """
     exchange = numeric.exchange
     classes = _classes(numeric, by_matrices=False)
-    links = {coupling_term.link for coupling_term in used_coupling_terms(numeric.schedules)}
-    if not all(map(exchange.is_complete, links)):  # the senders may differ from peer to peer
+    if incomplete_links(numeric.schedules, exchange):  # the senders may differ from peer to peer
         first_peers = itertools.islice(itertools.chain.from_iterable(classes), MOST_DIFFERENT + 1)
         classes = [PeerIndices((range(peer, peer + 1),)) for peer in first_peers]
     if len(classes) > MOST_DIFFERENT:
