@@ -18,7 +18,7 @@ from typing import Any, Unpack
 
 import numpy as np
 
-from apc.analysis.method_selection import cannot_serve, make_plan, refuse_varying
+from apc.analysis.method_selection import AnalysisPlan, cannot_serve, make_plan, refuse_varying
 from apc.analysis.nonlinear_elements import replaced_elements
 from apc.analysis.one_sided_slopes import Side, SideVerdict, severity, sides, worst_side
 from apc.compiler.compiled import LENGTH, Model
@@ -319,9 +319,6 @@ def _is_decided(analysis: Analysis) -> bool:
 def _analyze(side: Side, *, method: str, certify: bool, exact_work: float) -> Analysis:
     """Return the stability analysis of a side: a model that is differentiable at its start values.
 
-    The spectrum is computed by the method of the plan; the neutral modes then decide whether a model with
-    eigenvalues at 1 drifts or is stable up to common motions.
-
     Parameters
     ----------
     side
@@ -330,51 +327,21 @@ def _analyze(side: Side, *, method: str, certify: bool, exact_work: float) -> An
         As for `analyze_worst_side`.
     """
     numeric = side.numeric
-    system = numeric.model
+    system, nonlinear = numeric.model, not numeric.affine
+    elements = replaced_elements(system)
+    linearized = nonlinear or bool(elements)
     with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
-        plan = make_plan(numeric, method)
-        notes: tuple[Note, ...]
-        if not plan.groups:
-            spectrum, notes = _solve_populations(numeric)
-        elif plan.method == "determinant":
-            spectrum, notes = _solve_determinant(plan.loops), ()
-            matrices_fit = all(loop.states <= MATRIX_STATES for loop in plan.loops)
-            if (
-                method == "auto" and spectrum.stable is None and matrices_fit
-            ):  # matrices bound an undecided determinant
-                decomposed = decompose(plan.groups, numeric.exchange)
-                plan = replace(plan, method=decomposed.method, notes=decomposed.notes)
-                spectrum = _solve_closed(system, plan.loops, certify=certify, exact_work=exact_work)
-        else:
-            spectrum, notes = _solve_closed(system, plan.loops, certify=certify, exact_work=exact_work), ()
-        if method == "determinant" and not np.isfinite(spectrum.spectral_radius_error):
-            raise cannot_serve(
-                system, method, "rounding within a frame exceeds the eigenvalues of single peers"
-            )
-        if certify and (not plan.groups or plan.method == "determinant"):
-            notes = (*notes, Limitation(LimitationCode.NO_BALLS, (plan.method,)))
-        nonlinear = not numeric.affine
-        elements = replaced_elements(system)
-        linearized = nonlinear or bool(elements)
-        first_peers = () if plan.loops else representatives(numeric)
-        neutral_modes = _neutral_modes(spectrum, plan.loops, first_peers)
-        verdict, stable = spectrum.verdict, spectrum.stable
-        if verdict in (StabilityVerdict.STABLE_TRANSLATING, StabilityVerdict.DRIFTS):
-            verdict = (
-                StabilityVerdict.DRIFTS
-                if neutral_modes.drifts
-                else up_to(neutral_modes.translations, neutral_modes.rotations)
-            )
-            stable = verdict.stable
-        proof = spectrum.proof
-        if proof.outcome is ProofOutcome.DRIFTS and verdict is not StabilityVerdict.DRIFTS:
-            proof = replace(proof, outcome=ProofOutcome.STABLE)  # the drift is that of an unobservable memory
-        scopes = (
-            (ProofScope.LINEARIZATION, linearized),
-            (ProofScope.NOMINAL_NETWORK, bool(unreliable(system))),
-        )
-        if proof:
-            proof = replace(proof, scope=tuple(scope for scope, applies in scopes if applies))
+        plan, spectrum, notes = _spectrum(numeric, method, certify=certify, exact_work=exact_work)
+        neutral_modes = _neutral_modes(spectrum, plan.loops, () if plan.loops else representatives(numeric))
+    verdict, proof = _verdict(spectrum, neutral_modes), spectrum.proof
+    if proof.outcome is ProofOutcome.DRIFTS and verdict is not StabilityVerdict.DRIFTS:
+        proof = replace(proof, outcome=ProofOutcome.STABLE)  # the drift is that of an unobservable memory
+    scopes = (
+        (ProofScope.LINEARIZATION, linearized),
+        (ProofScope.NOMINAL_NETWORK, bool(unreliable(system))),
+    )
+    if proof:
+        proof = replace(proof, scope=tuple(scope for scope, applies in scopes if applies))
     return Analysis(
         topology=system.name,
         peers=numeric.exchange.peers,
@@ -382,7 +349,7 @@ def _analyze(side: Side, *, method: str, certify: bool, exact_work: float) -> An
         states_per_peer=max(map(states_of, numeric.schedules, numeric.subsystems)),
         method=plan.method,
         verdict=verdict,
-        stable=stable,
+        stable=verdict.stable,
         spectral_radius=spectrum.spectral_radius,
         spectral_radius_error=spectrum.spectral_radius_error,
         rigid_modes=spectrum.rigid_modes,
@@ -400,6 +367,43 @@ def _analyze(side: Side, *, method: str, certify: bool, exact_work: float) -> An
         rotations=neutral_modes.rotations,
         radius_excess=spectrum.radius_excess,
     )
+
+
+def _spectrum(
+    numeric: NumericModel, method: str, *, certify: bool, exact_work: float
+) -> tuple[AnalysisPlan, Spectrum, tuple[Note, ...]]:
+    """Return the plan of an analysis, the spectrum by its method, and notes on the solution.
+
+    An undecided determinant is followed by the matrices, where they fit.
+    """
+    system = numeric.model
+    plan = make_plan(numeric, method)
+    notes: tuple[Note, ...] = ()
+    if not plan.groups:
+        spectrum, notes = _solve_populations(numeric)
+    elif plan.method == "determinant":
+        spectrum = _solve_determinant(plan.loops)
+        matrices_fit = all(loop.states <= MATRIX_STATES for loop in plan.loops)
+        if method == "auto" and spectrum.stable is None and matrices_fit:
+            decomposed = decompose(plan.groups, numeric.exchange)
+            plan = replace(plan, method=decomposed.method, notes=decomposed.notes)
+            spectrum = _solve_closed(system, plan.loops, certify=certify, exact_work=exact_work)
+    else:
+        spectrum = _solve_closed(system, plan.loops, certify=certify, exact_work=exact_work)
+    if method == "determinant" and not np.isfinite(spectrum.spectral_radius_error):
+        raise cannot_serve(system, method, "rounding within a frame exceeds the eigenvalues of single peers")
+    if certify and (not plan.groups or plan.method == "determinant"):
+        notes = (*notes, Limitation(LimitationCode.NO_BALLS, (plan.method,)))
+    return plan, spectrum, notes
+
+
+def _verdict(spectrum: Spectrum, neutral_modes: NeutralModes) -> StabilityVerdict:
+    """Return the verdict of a spectrum: with eigenvalues at 1, that of their motions."""
+    if spectrum.verdict not in (StabilityVerdict.STABLE_TRANSLATING, StabilityVerdict.DRIFTS):
+        return spectrum.verdict
+    if neutral_modes.drifts:
+        return StabilityVerdict.DRIFTS
+    return up_to(neutral_modes.translations, neutral_modes.rotations)
 
 
 def _neutral_modes(

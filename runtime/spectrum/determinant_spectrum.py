@@ -138,14 +138,14 @@ def _spectrum(solved: Sequence[_SolvedSystem], multiplicities: Sequence[int]) ->
         item.drifts * multiplicity for item, multiplicity in zip(solved, multiplicities, strict=True)
     )
     inside = [False if item.zeros.low > 1 else True if item.zeros.high < 1 else None for item in solved]
-    verdict, stable = combine_verdicts(inside, rigid, drifts)
+    verdict = combine_verdicts(inside, rigid, drifts)
     notes = ["the largest modes only; the argument principle excludes larger ones"]
     if not all(item.zeros.counted for item in solved):
         notes = [
             "the largest modes found; the argument principle excludes larger ones only outside a wider circle"
         ]
     error = max(high - radius, radius - low, 0.0)
-    return Spectrum(tuple(modes), radius, error, rigid, drifts, verdict, stable, NO_PROOF, tuple(notes))
+    return Spectrum(tuple(modes), radius, error, rigid, drifts, verdict, NO_PROOF, tuple(notes))
 
 
 def _solve_loop(loop: ModalSystem) -> _SolvedSystem:

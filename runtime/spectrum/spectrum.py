@@ -119,12 +119,12 @@ class Mode:
 class Spectrum:
     """All modes but the rigid ones, the largest first, with the verdict.
 
-    `spectral_radius` is per frame; `stable` is None when the verdict is undecided. `spectral_radius_error`
-    bounds the deviation on both sides. The verdict needs the upper bound only: a model can be proved stable
-    although radius plus error exceeds 1. `drifts` is the number of motions that grow linearly. `proof` is the
-    result of ball arithmetic, `NO_PROOF` where floats decided; `notes` state the unproved parts.
-    `radius_excess` bounds the excess of the radius over 1 from below and above, if it was proved; the excess
-    can be smaller than the rounding of floats near 1.
+    `spectral_radius` is per frame; `verdict` counts every rigid mode as a translation.
+    `spectral_radius_error` bounds the deviation on both sides. The verdict needs the upper bound only: a
+    model can be proved stable although radius plus error exceeds 1. `drifts` is the number of motions that
+    grow linearly. `proof` is the result of ball arithmetic, `NO_PROOF` where floats decided; `notes` state
+    the unproved parts. `radius_excess` bounds the excess of the radius over 1 from below and above, if it was
+    proved; the excess can be smaller than the rounding of floats near 1.
     """
 
     modes: Sequence[Mode]
@@ -133,10 +133,14 @@ class Spectrum:
     rigid_modes: int
     drifts: int
     verdict: StabilityVerdict
-    stable: bool | None
     proof: StabilityProof
     notes: tuple[Note, ...]
     radius_excess: tuple[float, float] | None = None
+
+    @property
+    def stable(self) -> bool | None:
+        """Whether the verdict is stable, None if it is undecided."""
+        return self.verdict.stable
 
 
 def solve_spectrum(
@@ -196,7 +200,7 @@ def solve_spectrum(
     for system, solution in zip(systems, solved, strict=True):
         rigid += system.multiplicity * len(solution.rigid_modes.names)
         drifts += system.multiplicity * solution.rigid_modes.drifts
-    verdict, stable = combine_verdicts([solution.inside for solution in solved], rigid, drifts)
+    verdict = combine_verdicts([solution.inside for solution in solved], rigid, drifts)
     return Spectrum(
         modes=LazyTuple(functools.partial(_sorted_modes, tuple(systems), tuple(solved))),
         spectral_radius=radius,
@@ -204,7 +208,6 @@ def solve_spectrum(
         rigid_modes=rigid,
         drifts=drifts,
         verdict=verdict,
-        stable=stable,
         proof=_proof(solved, drifts),
         notes=tuple(notes),
         radius_excess=_radius_excess(solved),
@@ -298,19 +301,13 @@ def _proof(solved: Sequence[_SolvedLoop], drifts: int) -> StabilityProof:
     return StabilityProof(ProofMethod.BALLS, bits, outcome)
 
 
-def combine_verdicts(
-    inside: Sequence[bool | None], rigid: int, drifts: int
-) -> tuple[StabilityVerdict, bool | None]:
-    """Return the verdict, and whether it is stable (None: undecided), from the eigenvalue locations of each
-    system.
-    """
+def combine_verdicts(inside: Sequence[bool | None], rigid: int, drifts: int) -> StabilityVerdict:
+    """Return the verdict from the eigenvalue locations of each system; rigid modes count as translations."""
     if False in inside:
-        return StabilityVerdict.UNSTABLE, False
+        return StabilityVerdict.UNSTABLE
     if None in inside:
-        return StabilityVerdict.UNDECIDED, None
-    if drifts:
-        return StabilityVerdict.DRIFTS, False
-    return up_to(rigid), True
+        return StabilityVerdict.UNDECIDED
+    return StabilityVerdict.DRIFTS if drifts else up_to(rigid)
 
 
 def up_to(translations: int, rotations: int = 0) -> StabilityVerdict:

@@ -483,7 +483,7 @@ def _fill_block(
     certain = certain[~_has_wide_bound(pairs.error[certain])]
     valid = valid[certain]
     points_decided, radius = points[valid], pairs.radius[certain]
-    results.verdict[points_decided] = combine_verdicts([True], shared.rigid, shared.drifts)[0]
+    results.verdict[points_decided] = combine_verdicts([True], shared.rigid, shared.drifts)
     results.verdict[points_decided[radius > 1]] = StabilityVerdict.UNSTABLE
     results.spectral_radius[points_decided], results.spectral_radius_error[points_decided] = (
         radius,
