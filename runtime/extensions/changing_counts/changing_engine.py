@@ -9,8 +9,8 @@ Does not: read the instants (see `peer_times`).
 At the start of the frame of a change, in this order:
 
 1. The peers that leave are removed, with all their packets, also those in transit.
-2. Each peer that joins has its start values. The states and stored values of its parts in `PeerType.joining`
-   are the mean of those of the peers that stay.
+2. Each peer that joins has its start values. The states of its parts in `PeerType.joining` are the means of
+   those of all peers that stay, their stored values the means of those of its group.
 3. The packets of a peer that joins are, at each instant of sending, the mean m of the packets of the peers of
    its group that stay, shifted to its own values: m + s(own values) − mean of s(values of the others), where
    s gives the sent values. If all its sent values are means, so are its packets.
