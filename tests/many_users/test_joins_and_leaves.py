@@ -18,7 +18,7 @@ from apc.simulation.simulation import prepare
 from tests.bruteforce import TopologySource, frame_matrix
 from tests.commands import Cli
 from tests.hidden import hidden
-from tests.topologies import TOPOLOGIES
+from tests.topologies import TOPOLOGIES, compiled
 
 pytestmark = pytest.mark.needs_extension("changing_counts")
 
@@ -472,3 +472,13 @@ def test_the_verdict_is_that_of_the_peers_at_the_end(key: str, at: str, duration
         assert run.summary.fit is not None
         rate = np.log(analysis.spectral_radius) / FRAME
         assert run.summary.fit.rate == pytest.approx(rate, rel=1e-3)
+
+
+def test_a_float_next_to_the_start_of_a_frame_is_that_instant() -> None:
+    """21000 µs as 21000*1e-6 s is a float below 0.021."""
+    assert 21_000 * 1e-6 < 0.021
+    text = AVERAGE.read_text(encoding="utf-8").replace("8 ms", "3 ms")
+    runs = [
+        apc.simulate(compiled(text), duration=0.06, joins={"user[3]": at}) for at in (21_000 * 1e-6, "21 ms")
+    ]
+    assert np.array_equal(runs[0].values, runs[1].values, equal_nan=True)

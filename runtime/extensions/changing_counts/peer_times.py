@@ -30,6 +30,9 @@ from apc.timing.schedule import Schedule
 
 Flags = NDArray[np.bool_]
 
+# The distance from the start of a frame, relative to a frame, that is the rounding of a float in seconds.
+ROUNDED = Fraction(1, 10**9)
+
 NEVER = np.iinfo(np.int64).max  # the instant of a leave that does not happen
 
 _PEER = re.compile(r"(?P<group>.+?)(\[(?P<number>\d{1,9})\])?", re.ASCII)
@@ -114,7 +117,7 @@ def presence_of(system: Model, schedule: Schedule, duration: Fraction) -> Presen
                     raise _fault(system, key, item, name, f"one instant in {key}", "two")
                 given.add(peer)
                 _check_time(system, key, item, duration, frame_s)
-                array[peer] = int(item.at / schedule.quantum)
+                array[peer] = round(item.at / schedule.quantum)
                 if key == "leaves" and item.at <= (join := joins[peer] * schedule.quantum):
                     raise _fault(system, key, item, f"leave of {name}", f"after its join at {_s(join)}")
     presence = Presence(joins, leaves, first)
@@ -166,7 +169,7 @@ def _check_time(system: Model, key: str, item: PeerTime, duration: Fraction, fra
     subject = f"{key.removesuffix('s')} of {item.peer.strip()}"
     if not 0 < item.at < duration:
         raise _fault(system, key, item, subject, f"more than 0 s and less than the duration, {_s(duration)}")
-    if item.at % frame_s:
+    if abs(item.at - round(item.at / frame_s) * frame_s) > ROUNDED * frame_s:
         before = item.at // frame_s * frame_s
         near = [at for at in (before, before + frame_s) if 0 < at < duration]
         expected = f"the start of a frame of {1000 * float(frame_s):.9g} ms"
