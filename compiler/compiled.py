@@ -217,7 +217,8 @@ class Parameter:
     `exact` is the rational number whose nearest float is `value`, such as 5/3; None if `value` was given as a
     float, which represents its shortest decimal. Times that depend on a parameter are computed from `number`,
     since the equality of times determines the order of events. `display_unit` is the unit in the topology and
-    in outputs, as Modelica's displayUnit; empty if it is `unit`.
+    in outputs, as Modelica's displayUnit; empty if it is `unit`. `choice` states that the value is one of
+    named values, such as a side, which does not vary continuously.
     """
 
     name: str
@@ -230,6 +231,7 @@ class Parameter:
     description: str = ""
     exact: Fraction | None = None
     display_unit: str = ""
+    choice: bool = False
 
     @property
     def number(self) -> Fraction:

@@ -355,9 +355,10 @@ def _of_part(
     if isinstance(declared, ComponentVariable):
         return _named(name, value, f"start value: {declared.description or name.rpartition('.')[2]}")
     least, most = declared.minimum, declared.maximum
-    return _named(
+    parameter = _named(
         name, value, declared.description, least, most, exclusive_minimum=declared.exclusive_minimum
     )
+    return replace(parameter, choice=bool(declared.words))
 
 
 def all_parameters(

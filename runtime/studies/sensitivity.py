@@ -207,12 +207,16 @@ def sensitivities(numeric: NumericModel, *, analysis: Analysis | None = None) ->
 
 
 def varied(system: Model) -> list[ParameterRef]:
-    """Return the free parameters, without start values and parameters of unreliable links."""
+    """Return the free parameters that vary continuously.
+
+    Start values and parameters of unreliable links are left out.
+    """
     starts = {state.start for peer_type in system.peer_types for state in peer_type.states}
     starts |= {
         start for peer_type in system.peer_types for clock in peer_type.clocks for start in clock.starts
     }
     excluded = starts | channel_numbers(system)
+    excluded |= {parameter.name for parameter in system.parameters if parameter.choice}
     return [parameter_ref for parameter_ref in free_parameters(system) if parameter_ref.name not in excluded]
 
 

@@ -11,7 +11,7 @@ import apc
 from apc.compiler.compiled import Model
 from apc.studies.sensitivity import Sensitivities
 from tests.bench.sensitivity_truth import check_sensitivities, run
-from tests.topologies import AVERAGE, MESH, TOPOLOGIES, compiled, library, replaced
+from tests.topologies import AVERAGE, MESH, ONE_MASS, TOPOLOGIES, compiled, library, replaced
 
 NAMES = sorted(path.stem for path in TOPOLOGIES.glob("*.yaml") if path.stem != "template")
 GRAPH = ("delay: 8 ms}", "delay: 8 ms, graph: {edges: [[1, 2, 0.3], [1, 3, 0.3], [2, 3, 0.5]]}}")
@@ -209,3 +209,11 @@ couplers:
     assert (loose.verdict, loose.stable, loose.translations) == ("stable up to a common translation", True, 1)
     used = apc.analyze(system, params={"p.ki": "1 N/m"})
     assert (used.rigid_modes, used.unobservable) == (0, ())
+
+
+def test_a_side_is_no_number_that_varies() -> None:
+    """A named value, such as the side of a wall, has no derivative."""
+    wall = "type: VirtualWall, flange: device, side: right, position: 1 mm, stiffness: 100 N/m, clock: tick"
+    text = f"{ONE_MASS}clocks: {{tick: 1 ms}}\ncouplers: {{wall: {{{wall}}}}}\n"
+    names = [row.parameter for row in apc.sensitivities(compiled(text)).rows]
+    assert "wall.stiffness" in names and "wall.side" not in names
