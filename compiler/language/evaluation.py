@@ -32,7 +32,6 @@ from apc.compiler.language.expression import (
     names,
     walk,
 )
-from apc.compiler.language.grammar import parse_expression
 from apc.compiler.wording import cut
 
 Value = Fraction | float
@@ -249,6 +248,8 @@ def _fail(location: SourceLocation, node: Expr, code: str, message: str) -> NoRe
 @lru_cache(maxsize=1024)
 def _tree(text: str) -> Expr:
     """Return the parsed text of a formula, cached."""
+    from apc.compiler.language.grammar import parse_expression  # a slow import; few models have formulas
+
     return parse_expression(text, SourceLocation("a formula", 1, 1, text))
 
 

@@ -60,6 +60,7 @@ _EXACT = Context(prec=5000, traps=[Inexact])  # more digits than any number in a
 INTERVAL = "interval("  # prefix of the name of a clock's period, see `interval_of`
 V = TypeVar("V")
 
+MAX_LENGTH = 10_000  # characters of an expression
 PI = Fraction("3.1415926535897932384626433832795028841971693993751")  # OEIS A000796; the name `pi`
 
 Expr = NumberLiteral | Name | Call

@@ -29,6 +29,7 @@ from apc.compiler.language.expression import (
     FUNCTIONS,
     IN_EQUATIONS,
     KEYWORDS,
+    MAX_LENGTH,
     PI,
     Call,
     Equation,
@@ -52,7 +53,6 @@ from apc.compiler.language.parsing import (
 from apc.compiler.wording import cut
 
 SIMILAR = 0.8  # smallest similarity of an unknown function to a proposed one
-MAX_LENGTH = 10_000  # characters of an expression
 MAX_DEPTH = 100  # levels of the tree; Python's own stack allows about 300
 TOO_DEEP = f"the expression is nested more than {MAX_DEPTH} levels deep; give a subexpression a name"
 MAX_DIGITS = 1000  # characters of a number: Python refuses an integer of 4300 digits

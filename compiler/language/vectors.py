@@ -27,6 +27,7 @@ from apc.compiler.errors import ApcError, Diagnostic, SourceLocation, location_i
 from apc.compiler.language.expression import (
     CONDITIONS,
     FUNCTIONS,
+    MAX_LENGTH,
     Call,
     Equation,
     Expr,
@@ -36,7 +37,6 @@ from apc.compiler.language.expression import (
     format_expression,
     walk,
 )
-from apc.compiler.language.grammar import MAX_LENGTH
 
 T = TypeVar("T")
 SIZES = (2, 3)
