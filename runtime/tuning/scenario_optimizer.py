@@ -12,6 +12,7 @@ optimum. With active constraints i, ∇f + Σ μ_i ∇v_i = 0: the multipliers �
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -355,6 +356,18 @@ class ScenarioOptimizer:
 
 
 def _halton_points(count: int, size: int) -> Floats:
-    """Return points (count, size) spread over 0 to 1 by Halton's sequence, without randomness."""
-    halton = load_pool("scipy.stats.qmc").Halton(size, scramble=False)
-    return np.asarray(halton.random(count + 1)[1:])  # without the first point, the corner at 0
+    """Return points (count, size) spread over 0 to 1 by Halton's sequence, without the corner at 0.
+
+    Notes
+    -----
+    A coordinate of point i has the digits of i, in reverse order, as its fraction; the bases are the first
+    primes. SciPy has the same sequence, but its import takes longer than all evaluations of a search.
+    """
+    numbers = np.arange(1, count + 1)
+    primes = (number for number in itertools.count(2) if all(number % below for below in range(2, number)))
+    return np.transpose(
+        [
+            sum(numbers // base**digit % base / base ** (digit + 1) for digit in range(count.bit_length()))
+            for base in itertools.islice(primes, size)
+        ]
+    )
