@@ -38,11 +38,7 @@ from apc.output.formatting import (
     uncertain,
 )
 from apc.output.pictures import legend_below, new_figure
-from apc.output.region_picture import draw_intersection
 from apc.parameter_values.overrides import Override, apply
-from apc.regions.stable_region import region
-from apc.simulation.initial_velocity import WATCHED, initial_velocity
-from apc.simulation.trajectory import simulate
 from apc.tuning.specification import OPTIMALITY_GAP, RADIUS, SETTLING
 
 if TYPE_CHECKING:
@@ -268,6 +264,9 @@ def _scenario_models(tuning: Tuning) -> dict[str, Model]:
 
 def _draw_gains(tuning: Tuning, ax: Any) -> None:
     """Draw two gains at present and tuned over the intersection of the stable regions of all scenarios."""
+    from apc.output.region_picture import draw_intersection  # a slow import, for pictures only
+    from apc.regions.stable_region import region
+
     ranges = tuning.ranges[0], tuning.ranges[1]
     models = _scenario_models(tuning)
     active = {_where(binding) for binding in tuning.active}
@@ -290,6 +289,9 @@ def _draw_gains(tuning: Tuning, ax: Any) -> None:
 
 def _draw_impulse_response(tuning: Tuning, ax: Any) -> None:
     """Draw the impulse response in the most critical scenario, with the present and the tuned gains."""
+    from apc.simulation.initial_velocity import WATCHED, initial_velocity
+    from apc.simulation.trajectory import simulate  # a slow import, for pictures only
+
     topology = tuning.topologies[0]
     for label, values in (
         ("tuned", [gain.value for gain in tuning.gains]),
