@@ -19,6 +19,7 @@ import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -125,17 +126,20 @@ def parametric_closed_loop(
     """
     return ParametricClosedLoop(
         system,
-        parametric_frames(subsystems, system.subsystems),
+        parametric_frames(tuple(subsystems), system.subsystems),
         tuple(feedback_of(system, system.layout)),
         with_uncertainty(relative_coordinates(rigid.basis)),
         radius,
     )
 
 
+@lru_cache(maxsize=2)
 def parametric_frames(
-    subsystems: Sequence[LinearSubsystem], classes: Sequence[PeerClass]
+    subsystems: tuple[LinearSubsystem, ...], classes: tuple[PeerClass, ...]
 ) -> ParametricFrames:
     """Return subsystems with symbolic parameters, ready to be lifted over cells.
+
+    Closed systems of the same subsystems share the result, and its frames over the last cells.
 
     Parameters
     ----------
@@ -275,7 +279,7 @@ def matrices_over(problem: ParametricClosedLoop, cells: Sequence[Cell]) -> Matri
     cells
         The k cells over all parameters; points have equal lower and upper ends.
     """
-    maps = frames_over(problem.frames, cells)
+    maps = frames_over(problem.frames, tuple(cells))
     count = maps[0].p.shape[-3] - 2
     received = [
         InterconnectionMatrices(within(feedback.direct, count), within(feedback.delayed, count))
@@ -294,7 +298,8 @@ def matrices_over(problem: ParametricClosedLoop, cells: Sequence[Cell]) -> Matri
     return scaled
 
 
-def frames_over(problem: ParametricFrames, cells: Sequence[Cell]) -> list[FrameMap]:
+@lru_cache(maxsize=2)  # the cells, and their middles
+def frames_over(problem: ParametricFrames, cells: tuple[Cell, ...]) -> list[FrameMap]:
     """Return the frame map of each subsystem over cells (k, 2 + m, …), with k = 1 for constant subsystems.
 
     Parameters

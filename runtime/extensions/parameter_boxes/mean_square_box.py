@@ -158,7 +158,7 @@ def _box_problem(system: Model, ranges: Sequence[Range]) -> _BoxProblem:
     subsystems = tuple(parametric.subsystems[group.name] for group in reception.groups)
     frames = parametric_frames(subsystems, reception.groups)
     box = tuple((ranges[index].low, ranges[index].high) for index in peer_ranges)
-    maps = [frame_map.mapped(lambda block: hull(block)[0]) for frame_map in frames_over(frames, [box])]
+    maps = [frame_map.mapped(lambda block: hull(block)[0]) for frame_map in frames_over(frames, (box,))]
     lifted_wide = [group.with_lifted(frame) for group, frame in zip(reception.groups, maps, strict=True)]
     loop_over_box = peer_classes(replace(reception, groups=tuple(lifted_wide)))[0]
     memories = stored_of(parametric.at, reception, loop_over_box)
@@ -218,7 +218,8 @@ def _test_cells(problem: _BoxProblem, cells: Sequence[Cell]) -> Iterator[CellVer
     widths = np.array([float(interval.high - interval.low) for interval in problem.ranges])
     for start in range(0, len(cells), TOGETHER):
         batch = cells[start : start + TOGETHER]
-        maps = frames_over(problem.frames, [tuple(cell[index] for index in problem.local) for cell in batch])
+        local = tuple(tuple(cell[index] for index in problem.local) for cell in batch)
+        maps = frames_over(problem.frames, local)
         for index, cell in enumerate(batch):
             lifted = [frame_map.mapped(partial(_cell_matrix, index, len(cell))) for frame_map in maps]
             proved, decays = _proves_cell(problem, cell, lifted)
