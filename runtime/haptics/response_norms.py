@@ -7,10 +7,14 @@ Does not: compute them (see `extensions.system_norms`).
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+
+from apc.support.threads import single_threaded
 
 Floats = NDArray[np.float64]
 
@@ -27,20 +31,27 @@ class Peak:
     frequency_hz: float
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class HinfGains:
     """The H∞ norms of one mode: gains from a force to the velocity of devices, or to a copy's error.
 
     `on_ticks` is for held forces and motions read at the instants of events; `sampled_data` for arbitrary
-    forces, with the largest gain `gains` (k,) at each frequency. `of` is the output: "velocity" of a device,
-    or "error", the distance of a copy from the mean of all copies in a difference mode of equal peers.
+    forces; `gains_of` computes the largest gain at each frequency, see `gains`. `of` is the output:
+    "velocity" of a device, or "error", the distance of a copy from the mean of all copies in a difference
+    mode of equal peers.
     """
 
     mode: str
     of: str
     on_ticks: Peak
     sampled_data: Peak
-    gains: Floats = field(compare=False)
+    gains_of: Callable[[], Floats] = field(compare=False, repr=False)
+
+    @cached_property
+    def gains(self) -> Floats:
+        """The largest gain (k,) at each frequency, computed on first access: norms do not use it."""
+        with single_threaded(), np.errstate(all="ignore"):
+            return self.gains_of()
 
 
 @dataclass(frozen=True, slots=True)

@@ -250,7 +250,10 @@ def _rows_shown(transparency: Transparency) -> Iterator[tuple[str, ...]]:
 def transparency_document(transparency: Transparency) -> Plain:
     """Return the same as plain data, in SI; complex numbers as pairs."""
     instead = {
-        "hinf": {f"{extremes.mode} {extremes.of}": extremes for extremes in transparency.hinf},
+        "hinf": {
+            f"{extremes.mode} {extremes.of}": record(extremes, {"gains": extremes.gains})
+            for extremes in transparency.hinf
+        },
         "h2": {noise.source: noise for noise in transparency.h2},
         "h2_rms": NOISE_RMS,
     }

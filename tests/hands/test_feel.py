@@ -124,6 +124,9 @@ def test_a_lone_mass_feels_like_itself() -> None:
         assert value == pytest.approx(expected, abs=off)
     # |v/F| = 1/|b + jωm| is largest at rest, where it is 1/b.
     assert found.hinf[0].sampled_data.norm == pytest.approx(1 / 3, rel=1e-9)
+    # The gains at the frequencies are those of the fundamental, and are evaluated on demand.
+    assert str(found) and "gains" not in vars(found.hinf[0])
+    np.testing.assert_allclose(found.hinf[0].gains, 1 / np.abs(found.impedance), rtol=1e-7)
     # Each tick's 1 N rms: v⁺ = e^{−bT/m} v + (1 − e^{−bT/m})/b F, whose variance is (1 − a)²/(b²(1 − a²)).
     with mpmath.workdps(50):
         decay = mpmath.exp(mpmath.mpf(-3) / 2000)

@@ -15,9 +15,10 @@ of this map).
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from fractions import Fraction
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -40,6 +41,7 @@ from apc.spectrum.relative_coordinates import relative, relative_coordinates, re
 
 Floats = NDArray[np.float64]
 Matrix = NDArray[Any]
+Gains = Callable[[], Floats]
 
 # Gauss nodes of an interval, and the additional ones for the error estimate.
 NODES, MORE = 4, 2
@@ -69,8 +71,9 @@ def tick_peak(loop: DrivenMode, pushed: int, output: int, row: int, basis: Float
 
 def sampled_data_peak(
     loop: DrivenMode, pushed: int, output: int, row: int, basis: Floats, frequency_hz: Floats
-) -> tuple[Peak, Floats]:
-    """Return the H∞ norm of the map from arbitrary forces to motions at all times, and its gains (k,).
+) -> tuple[Peak, Gains]:
+    """Return the H∞ norm of the map from arbitrary forces to motions at all times, and a function that
+    returns its gains (k,).
 
     The norm is the supremum of the gains of a stable mode, and infinite for an unstable mode.
 
@@ -99,8 +102,11 @@ def _peak(
     at: Floats,
     weights: Floats,
     frequency_hz: Floats,
-) -> tuple[Peak, Floats]:
-    """Return norm and gains with forces and motions at nodes (q,), 0 to 1, of each interval, with weights."""
+) -> tuple[Peak, Gains]:
+    """Return the norm, and the function of the gains.
+
+    Forces and motions are taken at nodes (q,), 0 to 1, of each interval, with weights.
+    """
     subsystem, output_subsystem, nodes = loop.subsystems[pushed], loop.subsystems[output], len(at)
     # The coefficients over σ^i/i!, σ from 0 to 1, of a force that is 1 at its node and 0 at the others.
     powers = at[:, None] ** np.arange(nodes) / np.cumprod([1, *range(1, nodes)])
@@ -128,16 +134,16 @@ def _peak(
         if pushed == output:
             through[node_columns, node_columns] = scale * force_map / float(seconds) ** 0.5
     if not all(np.isfinite(matrix).all() for matrix in (inputs, outputs, through)):  # overflow
-        return Peak(np.nan, np.nan, np.nan), np.full(len(frequency_hz), np.nan)
+        return Peak(np.nan, np.nan, np.nan), partial(np.full, len(frequency_hz), np.nan)
     c = outputs @ value_of(loop.c)
     if _observes_rigid_mode(basis, c):
-        return Peak(np.inf, 0.0, 0.0), np.full(len(frequency_hz), np.inf)
+        return Peak(np.inf, 0.0, 0.0), partial(np.full, len(frequency_hz), np.inf)
     coordinates = relative_coordinates(basis)
     b, c = relative_rows(value_of(loop.k) @ inputs, coordinates), c[:, coordinates.rest]
     a = relative(loop.m, with_uncertainty(coordinates), MIDPOINT_RADIUS)
     d = outputs @ value_of(loop.d) @ inputs + through
     radians_per_hz = 2 * np.pi * float(loop.frame)
-    gains = gains_at(value_of(a), b, c, d, radians_per_hz * frequency_hz)
+    gains = partial(gains_at, value_of(a), b, c, d, radians_per_hz * frequency_hz)
     gain, angle = peak_gain(value_of(a), b, c, d)
     if not np.isfinite(gain):
         fastest = max(np.linalg.eigvals(value_of(a)), key=abs)
