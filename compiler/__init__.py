@@ -3,7 +3,7 @@
 A module imports only modules listed before it.
 
 Shared      `errors`, `wording`, `number_parsing`; `timings` of a command; `files`: reading and writing;
-            `multiples` of exact times; `weights` of peers; `message_catalogue` of message codes
+            `multiples` of exact times; `disjoint_sets` of names; `weights` of peers; `message_catalogue`
 `source`    `nodes`, `yaml_errors`, `compose`, `source`: YAML to nodes; `reading`: nodes to typed values
 `language`  `expression`, `parsing`, `grammar`: text to trees; `constants`; `evaluation`: trees to numbers;
             `dimensions`, `units`, `unit_text`, `unit_check`; `vectors`; `values`: numbers of a topology;

@@ -29,9 +29,8 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
-from scipy.cluster.hierarchy import DisjointSet
-
 from apc.compiler.components.component import Component
+from apc.compiler.disjoint_sets import DisjointSets
 from apc.compiler.equations.flatten import (
     CONNECTION,
     FlatEquation,
@@ -247,7 +246,7 @@ class _Clocks:
         self._dimensions = {variable.name: variable.dimension for variable in peer_type.variables}
         self.given: dict[str, FlatEquation] = {}
         self._crossings = {crossing.symbol: crossing for crossing in peer_type.crossings}
-        self._sets = DisjointSet()
+        self._sets = DisjointSets()
         sample_clocks = (
             crossing.clock for crossing in peer_type.crossings if isinstance(crossing, SampleCrossing)
         )
@@ -306,8 +305,7 @@ class _Clocks:
 
     def _root(self, name: str) -> str:
         """Return the representative name of the set of a name."""
-        self._sets.add(name)
-        return str(self._sets[name])
+        return next(iter(self._sets[name]))
 
     def _visit(
         self, expression: Expr, domain: str, equation: FlatEquation, receiving: dict[str, FlatEquation]
@@ -359,7 +357,8 @@ class _Clocks:
         domain_clock, name_clock = self.known_clock(domain), self.known_clock(name)
         if domain_clock and name_clock and domain_clock != name_clock:
             self._report(shown, name_clock, domain_clock, equation)
-        elif self._sets.merge(self._root(domain), self._root(name)) and (domain_clock or name_clock):
+        else:
+            self._sets.merge(domain, name)
             self._clocks[self._root(name)] = domain_clock or name_clock
 
     def _report(self, name: str, clock: str, other_clock: str, equation: FlatEquation) -> None:

@@ -11,9 +11,8 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from scipy.cluster.hierarchy import DisjointSet
-
 from apc.compiler.components.parts import PartEntry
+from apc.compiler.disjoint_sets import DisjointSets
 from apc.compiler.errors import Diagnostic, Mistakes
 from apc.compiler.source.nodes import Scalar
 from apc.compiler.source.nodes import Sequence as ListNode
@@ -83,7 +82,7 @@ def topology_warnings(
     masses = [part for part in outer if part.section == "masses"]
     group_settings = {name for group in groups for name, _ in (*group.values, *group.words, *group.columns)}
     for part in reversed(masses):  # of one location, `Mistakes` reports the last first
-        connected_names = {group: connected[group].subset(part.name) for group in part.groups}
+        connected_names = {group: connected[group][part.name] for group in part.groups}
         alone = [group for group, names in connected_names.items() if len(names) == 1]
         if alone and part.component.connectors and not part.connections:
             where = "" if len(alone) == len(connected_names) else f" of {' and '.join(alone)}"
@@ -119,12 +118,12 @@ def topology_warnings(
     return warnings.result
 
 
-def _joined(parts: Sequence[PartInstance]) -> DisjointSet:
+def _joined(parts: Sequence[PartInstance]) -> DisjointSets:
     """Return the sets of parts of one group that are connected to each other; the ground connects nothing."""
-    result = DisjointSet(part.name for part in parts)
+    result, names = DisjointSets(), {part.name for part in parts}
     for part in parts:
         for _, other, _ in part.connections:
-            if other in result:
+            if other in names:
                 result.merge(part.name, other)
     return result
 
