@@ -23,7 +23,7 @@ from apc.compiler.files import FileReader
 from apc.compiler.functions.functions import build_functions
 from apc.compiler.source.source import Source, read_source
 from apc.compiler.timings import part
-from apc.compiler.topology.topology import Topology, build_topology, library_folders
+from apc.compiler.topology.topology import Topology, read_topology
 
 Stage = Literal["source", "topology", "flat", "clocked", "sorted", "compiled"]
 StageValue = Source | Topology | FlatSystem | ClockedSystem | SortedSystem | Model
@@ -116,7 +116,7 @@ def stages_of(source: Source) -> Iterator[tuple[Stage, StageValue]]:
     assert source.path is not None
     path, reader = source.path, source.reader
     steps: dict[Stage, Callable[[Any], StageValue]] = {
-        "topology": lambda source: build_topology(source, Library(library_folders(source), reader=reader)),
+        "topology": read_topology,
         "flat": flatten,
         "clocked": partition,
         "sorted": sort,

@@ -21,7 +21,7 @@ from apc.compiler.components.component import Component
 from apc.compiler.components.component_library import Library
 from apc.compiler.message_catalogue import catalogue, ranges
 from apc.compiler.view.catalogue import component_document, library_document, topologies
-from apc.compiler.view.listing import diagram_of
+from apc.compiler.view.diagram import diagram_of
 from apc.output.graph import graph_picture
 from apc.output.pictures import svg_text
 

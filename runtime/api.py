@@ -1315,14 +1315,14 @@ def show(path: str | Path, *, format: Format = "text") -> str:
         case "json":
             return json_text(listing.show_document(path))
         case "dot":
-            return diagram.draw_dot(listing.diagram_of(path))
+            return diagram.draw_dot(diagram.diagram_of(path))
         case "mermaid":
-            return diagram.draw_mermaid(listing.diagram_of(path))
+            return diagram.draw_mermaid(diagram.diagram_of(path))
         case "svg":
             from apc.output.graph import graph_picture
             from apc.output.pictures import svg_text
 
-            return svg_text(graph_picture(listing.diagram_of(path)))
+            return svg_text(graph_picture(diagram.diagram_of(path)))
 
 
 @checked

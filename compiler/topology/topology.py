@@ -1,7 +1,7 @@
 """A topology as typed data: every quantity in SI, every name resolved.
 
-Takes: the YAML source of a topology and a library. Gives: `build_topology`, the `Topology`;
-`library_folders`, `readable_library`.
+Takes: the YAML source of a topology and a library. Gives: `build_topology`, `read_topology`, the
+`Topology`; `library_folders`, `readable_library`.
 Guarantees: parts, clocks, links, parameters and connections that are named exist; quantities have the unit
 their parameter requires and lie within its bounds; inner parts and array elements are separate parts; all
 mistakes of the file are reported together.
@@ -157,6 +157,11 @@ def readable_library(
 def _folder_of(source: Source) -> Path:
     """Return the folder that relative paths of a topology refer to."""
     return source.path.parent if source.path is not None else Path()
+
+
+def read_topology(source: Source) -> Topology:
+    """Return `build_topology` of a source with its own library."""
+    return build_topology(source, Library(library_folders(source), reader=source.reader))
 
 
 def build_topology(source: Source, library: Library) -> Topology:

@@ -1,8 +1,8 @@
 """A topology as a graph: connected parts of a peer, peers connected over links; as text for Graphviz and
 Mermaid.
 
-Takes: `Topology`. Gives: `Diagram` of `Box` and `DiagramEdge`, `build_diagram`; `draw_dot`, `draw_mermaid`;
-`node_of`, `shape_of`, `seconds`.
+Takes: `Topology`, or its file. Gives: `Diagram` of `Box` and `DiagramEdge`, `build_diagram`, `diagram_of`;
+`draw_dot`, `draw_mermaid`; `node_of`, `shape_of`, `seconds`.
 Guarantees: the graph contains every part of the topology, a long array as one box; the same topology gives
 the same text.
 Does not: lay out the graph on a page (see `output.graph`, Graphviz, Mermaid).
@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 from fractions import Fraction
 from html import escape
 from operator import itemgetter
+from pathlib import Path
 
 from apc.compiler.components.component import ComponentVariable, NumberParameter, Reference
 from apc.compiler.components.parts import DEFAULT_TYPES, GROUND
@@ -23,10 +24,11 @@ from apc.compiler.language.dimensions import SECOND
 from apc.compiler.language.expression import format_expression
 from apc.compiler.language.values import ScalarValue
 from apc.compiler.language.vectors import by_vector, whole_and_index
+from apc.compiler.source.source import read_source
 from apc.compiler.topology.channels import ChannelDeclaration
 from apc.compiler.topology.instances import PartInstance
 from apc.compiler.topology.links import LinkDeclaration
-from apc.compiler.topology.topology import Topology
+from apc.compiler.topology.topology import Topology, read_topology
 from apc.compiler.wording import counted
 
 ROLES = {"masses": "mass", "couplers": "coupler", "hands": "hand"}
@@ -111,6 +113,11 @@ def build_diagram(topology: Topology) -> Diagram:
     links, groups = [*map(_link_box, topology.links)], [*_group_boxes(topology)]
     sent += [DiagramEdge(link.key, group.key, sent=True) for link in links for group in groups]
     return Diagram(topology, (*boxes.values(), *links, *groups), (*connections, *sent))
+
+
+def diagram_of(path: Path) -> Diagram:
+    """Return the graph of a topology file; no equations are read."""
+    return build_diagram(read_topology(read_source(path)))
 
 
 def _array_name(name: str) -> str:

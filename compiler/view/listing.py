@@ -1,7 +1,7 @@
 """The contents of a topology as text for the user: the output of `apc show`.
 
 Takes: a topology's path.
-Gives: `show_text` and `show_document` (for JSON); `diagram_of`.
+Gives: `show_text` and `show_document` (for JSON).
 Guarantees: `show_text` has at most 80 columns unless a name is longer; the output is reproducible to the
 byte.
 Does not: analyze, or compute new values.
@@ -26,7 +26,7 @@ from apc.compiler.equations.solution import Assignment, ImplicitBlock
 from apc.compiler.equations.terms import text_of
 from apc.compiler.language.unit_text import format_dimension
 from apc.compiler.multiples import common_multiple
-from apc.compiler.pipeline import each_stage, run_stages
+from apc.compiler.pipeline import each_stage
 from apc.compiler.topology.topology import Topology
 from apc.compiler.view.diagram import Diagram, build_diagram, node_of, seconds, shape_of
 from apc.compiler.view.stages import sent_text
@@ -114,13 +114,6 @@ def _step_document(step: Assignment | ImplicitBlock) -> dict[str, Any]:
 def _computed(values: Iterable[Assignment]) -> list[dict[str, str]]:
     """Return assignments as plain data."""
     return [{"name": name, "is": text_of(value)} for name, value in values]
-
-
-def diagram_of(path: Path) -> Diagram:
-    """Return the graph of a topology."""
-    topology = run_stages(path, until="topology")
-    assert isinstance(topology, Topology)
-    return build_diagram(topology)
 
 
 def _graph_lines(diagram: Diagram) -> Iterator[str]:

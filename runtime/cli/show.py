@@ -56,7 +56,7 @@ def show_command(
     path = find_input(file, compiled_too=False)
     check_topology_outputs(path, {"--out": out})
     if out is not None and out.suffix.lower() in PICTURES:
-        from apc.compiler.view.listing import diagram_of
+        from apc.compiler.view.diagram import diagram_of
         from apc.output.graph import graph_picture
         from apc.output.pictures import check_picture, write_figure
 

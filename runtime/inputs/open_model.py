@@ -250,14 +250,12 @@ def check_topology_outputs(path: Path, outputs: Mapping[str, Path | None]) -> No
     for output in given:
         check_target(output)
     if any(output.exists() for output in given):
-        from apc.compiler.pipeline import run_stages
         from apc.compiler.source.source import read_source
-        from apc.compiler.topology.topology import Topology, library_folders
+        from apc.compiler.topology.topology import library_folders, read_topology
 
-        topology = run_stages(path, until="topology")
-        assert isinstance(topology, Topology)
-        folders = (str(folder.resolve()) for folder in library_folders(read_source(path)))
-        check_outputs(path, (*topology.texts, *folders), outputs)
+        source = read_source(path)
+        folders = (str(folder.resolve()) for folder in library_folders(source))
+        check_outputs(path, (*read_topology(source).texts, *folders), outputs)
 
 
 def check_outputs(path: Path, texts: Iterable[str], outputs: Mapping[str, Path | None]) -> None:

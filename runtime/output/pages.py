@@ -17,8 +17,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from apc.analysis_report import answer
-from apc.compiler.pipeline import compile_topology
-from apc.compiler.view.listing import diagram_of
+from apc.compiler.view.diagram import diagram_of
 from apc.output.graph import graph_picture
 from apc.output.pictures import svg_image
 
@@ -62,6 +61,8 @@ def gallery_page(topologies: Sequence[Path]) -> str:
 
 def _topology(path: Path) -> dict[str, Any]:
     """Return the page's text for a model."""
+    from apc.compiler.pipeline import compile_topology  # it imports algebra, which a report does not need
+
     system = compile_topology(path)
     return {
         "name": path.stem,

@@ -93,7 +93,7 @@ def _is_dead(item: Any) -> bool:
 @part("page")
 def report_page(report: Report) -> str:
     """Return a report as one HTML document."""
-    from apc.compiler.view.listing import diagram_of  # of the topologies as written
+    from apc.compiler.view.diagram import diagram_of  # of the topologies as written
 
     text = json_text(report_document(report), indent=None)
     drawing = {"diagram_of": diagram_of, "graph_picture": graph_picture}

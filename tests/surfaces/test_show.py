@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 import apc
-from apc.compiler.view.listing import diagram_of
+from apc.compiler.view.diagram import diagram_of
 from apc.output.graph import graph_picture
 from tests.commands import Cli, Ran, folder, write
 from tests.topologies import AVERAGE, MESH, ONE_MASS, TOPOLOGIES, replaced
