@@ -155,9 +155,9 @@ def check_picture(path: Path, option: str = "--plot", more: Sequence[str] = ()) 
 def svg_text(figure: Any) -> str:
     """Return a matplotlib Figure as an SVG element, for a page."""
     matplotlib = need("matplotlib", "plot")
-    written = io.StringIO()
-    with matplotlib.rc_context(SVG):
-        figure.savefig(written, format="svg", metadata={"Date": None, "Creator": None})
+    canvas, written = need("matplotlib.backends.backend_svg", "plot").FigureCanvasSVG(figure), io.StringIO()
+    with matplotlib.rc_context(SVG):  # `savefig` draws a figure a second time to arrange it
+        canvas.print_svg(written, metadata={"Date": None, "Creator": None})
     plotted = written.getvalue()
     return re.sub(r"<metadata>.*?</metadata>", "", plotted[plotted.index("<svg") :], flags=re.DOTALL)
 
