@@ -231,6 +231,7 @@ class _Tuner:
     progress: Progress
     scenarios: list[Scenario] = field(default_factory=list)
     evaluations: int = 0
+    evaluated: dict[bytes, Floats] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self.constraints = ConstraintSet(numeric_model(self.system), self.spec, self.until)
@@ -364,9 +365,17 @@ class _Tuner:
             starts += better_starts
         raise AssertionError("turns never end")
 
+    def _worst_cases(self, gains: Sequence[Fraction] | Floats) -> Floats:
+        """Return the largest constraint in each scenario (s,) at gains (m,), computed once."""
+        point = np.array(gains, dtype=np.float64)
+        key = point.tobytes()
+        if key not in self.evaluated:
+            self.evaluated[key] = self.constraints.worst_case(self.every, point[None])[0]
+        return self.evaluated[key]
+
     def _add_scenarios(self, gains: Floats, level: float) -> bool:
         """Add the scenarios with constraints above a level; return whether any were added."""
-        worst = self.constraints.worst_case(self.every, gains[None])[0]
+        worst = self._worst_cases(gains)
         order = np.argsort(-worst)
         additions = [self.every[index] for index in order[:MORE] if worst[index] > level + ABOVE]
         additions = [candidate for candidate in additions if candidate not in self.scenarios]
@@ -395,12 +404,13 @@ class _Tuner:
         relaxations = list(all_relaxations)
         while True:
             gains = self._rounded_gains(optimum, relaxations[0])
-            point = np.array([float(gain) for gain in gains])
-            if column is not None and not self.timed_out and self._add_scenarios(point, -ABOVE):
+            if (
+                column is not None
+                and not self.timed_out
+                and self._add_scenarios(np.array(gains, np.float64), -ABOVE)
+            ):
                 continue
-            satisfied = (
-                column is None or float(self.constraints.worst_case(self.every, point[None]).max()) < 0
-            )
+            satisfied = column is None or float(self._worst_cases(gains).max()) < 0
             last = self.timed_out or len(relaxations) == 1
             if satisfied or last:
                 proofs, failed = self._proofs(gains, whole=last)
@@ -472,7 +482,7 @@ class _Tuner:
             Override(interval.free, value) for interval, value in zip(self.spec.free, gains, strict=False)
         ]
         point = np.array([[float(gain) for gain in gains]])
-        worst = self.constraints.worst_case(self.every, point)[0]
+        worst = self._worst_cases(gains)
         order: dict[tuple[Override, ...], None] = {}
         for index in np.argsort(-worst, kind="stable"):
             numbers, _ = self.constraints.settings[self.every[index].setting]
@@ -569,10 +579,7 @@ class _Tuner:
         """
         if self.spec.objective.column is not None or self.constraints.by_scalar_criterion:
             return math.exp(self.constraints.allowed)
-        point = np.array([[float(gain) for gain in gains]])
-        margin = 1 - math.exp(
-            float(self.constraints.worst_case(self.every, point).max()) + self.constraints.allowed
-        )
+        margin = 1 - math.exp(float(self._worst_cases(gains).max()) + self.constraints.allowed)
         return float(1 - _decimal(margin * (1 - BACK[-1]), DIGITS, ROUND_FLOOR))
 
     def _violated_scenario(
@@ -603,9 +610,7 @@ class _Tuner:
         optimality bound.
         """
         spec, column = self.spec, self.spec.objective.column
-        largest_constraint = float(
-            self.constraints.worst_case(self.every, np.array([[float(gain) for gain in gains]])).max()
-        )
+        largest_constraint = float(self._worst_cases(gains).max())
         feasible = feasible and (column is None or largest_constraint < 0)
         value = float(gains[column]) if column is not None else self._required_radius(gains)
         if column is None and self.constraints.by_scalar_criterion:
@@ -692,7 +697,7 @@ class _Tuner:
         extension = find_extension("parameter_boxes")
         if extension is None:
             return None
-        worst = self.constraints.worst_case(self.every, np.array([[float(gain) for gain in gains]]))[0]
+        worst = self._worst_cases(gains)
         order = np.argsort(-worst, kind="stable").tolist()
         scenarios = dict.fromkeys([*self._active_scenarios(optimum), *(self.every[index] for index in order)])
         self.progress("proving global optimality")
