@@ -39,7 +39,6 @@ from apc.studies.representative_delays import representative_delays
 from apc.studies.stability_criteria import SCALAR_CRITERIA, RadiusEvaluator
 from apc.support.extension_table import require_extension
 from apc.support.not_supported import NotSupportedError
-from apc.support.threads import load_pool
 from apc.tuning.specification import CONSTRAINT, HINF, LOCATION, Objective, TransparencyMetric, TuningSpec
 from apc.verdict import LimitationCode
 
@@ -67,7 +66,7 @@ TINY = 1e-300  # the least magnitude of which a logarithm is taken
 SLOWEST, LARGER = 1e-3, 1e-6
 
 # Points of a grid along each range of a box; the tolerances of the search for the largest constraint.
-GRID, POWELL = 5, {"xtol": 1e-5, "ftol": 1e-12}
+GRID, NARROW = 5, 1e-6
 
 # The value used for ln |λ| of a missing matrix, and of a missing mode.
 BEYOND, NONE = 3.0, -30.0
@@ -203,8 +202,8 @@ class ConstraintSet:
         """Return the scenario in the box with the largest constraint at columns (m,) in a setting, and
         its value.
 
-        The largest value on a grid is refined by Powell's method, which uses no slopes: the maximum may be on
-        a ridge between two modes.
+        The grid is refined around its largest value, without slopes: the maximum may be on a ridge between
+        two modes.
         """
         low, high = np.array([(float(interval.low), float(interval.high)) for interval in self.spec.box]).T
 
@@ -216,19 +215,14 @@ class ConstraintSet:
             ]
             return np.asarray(np.max(sizes, axis=0))
 
-        grid = np.array(list(itertools.product(np.linspace(0, 1, GRID), repeat=len(low))))
-        start = grid[int(np.argmax(value(grid)))]
-        minimize = load_pool("scipy.optimize").minimize
-        bounds = [(0.0, 1.0)] * len(low)
-        maximum = minimize(
-            lambda position: -float(value(position[None])[0]),
-            start,
-            method="Powell",
-            bounds=bounds,
-            options=POWELL,
-        )
-        point = low + np.clip(maximum.x, 0, 1) * (high - low)
-        return Scenario(setting, tuple(point.tolist())), -float(maximum.fun) - self.allowed
+        count = GRID**2 if len(low) == 1 else GRID
+        offsets = np.array(list(itertools.product(np.linspace(-1, 1, count), repeat=len(low))))
+        best, width, values = np.full(len(low), 0.5), 0.5, np.empty(0)
+        while width > NARROW:
+            points = np.clip(best + width * offsets, 0, 1)
+            values = value(points)
+            best, width = points[int(np.argmax(values))], width * 2 / (count - 1)
+        return Scenario(setting, tuple((low + best * (high - low)).tolist())), values.max() - self.allowed
 
     @property
     def views(self) -> list[TuningSpec]:

@@ -15,9 +15,11 @@ import pytest
 import apc
 from apc.extensions.loss_models.time_varying_delay import loop_gain
 from apc.extensions.pareto_front.trade_off import pareto_front
+from apc.lifting.numeric_model import numeric_model
 from apc.output.formatting import full_digits
 from apc.output.tuning_output import panels_of
 from apc.parameter_values.parameter_names import ParameterRef
+from apc.tuning.constraints import ConstraintSet
 from apc.tuning.specification import TuningSpec, read_tradeoff, read_tuning_spec
 from tests.commands import Cli, write
 from tests.topologies import AVERAGE, MESH, TOPOLOGIES, compiled, messages_of, replaced, wall
@@ -204,6 +206,18 @@ def test_motions_die_out_no_faster_with_any_gains_of_a_grid() -> None:
         assert "±" in str(found) and "±" not in str(replace(found, error=math.inf))
     typed = {one.parameter: float(one.value) for one in found.gains}
     assert apc.analyze(compiled(AVERAGE), params=typed).spectral_radius < found.value
+
+
+def test_the_worst_point_of_a_box_is_on_a_ridge_and_at_an_edge() -> None:
+    """Inside the range of one mass, where two modes meet, and at the end of the other."""
+    gains, over = {K: 2395.42, B: 29.6553}, ["user.count=2:3", f"{MASS}=±20%", "cube.mass=±10%"]
+    model, free = compiled(AVERAGE), [f"{K}=10 N/m:5000 N/m", f"{B}=0 N*s/m:50 N*s/m"]
+    spec = read_tuning_spec(model, free, maximize=K, over=over)
+    worst, value = ConstraintSet(numeric_model(model), spec).worst_case_within(0, np.array([*gains.values()]))
+    assert 0.081 < worst.point[0] < 0.119 and worst.point[1] == 0.54
+    masses, at = worst.point[0] + np.linspace(-1e-3, 1e-3, 20001), {"user.count": 2, "cube.mass": 0.54}
+    radii = apc.analyze_many(model, {MASS: masses}, params=gains | at).spectral_radius
+    assert value == pytest.approx(math.log(radii.max()), abs=1e-9)
 
 
 def test_what_is_asked_beside_stability_is_kept_and_what_time_leaves_open_is_said() -> None:
