@@ -11,6 +11,7 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
+from scipy.stats import qmc
 
 import apc
 from apc.extensions.loss_models.time_varying_delay import loop_gain
@@ -20,6 +21,7 @@ from apc.output.formatting import full_digits
 from apc.output.tuning_output import panels_of
 from apc.parameter_values.parameter_names import ParameterRef
 from apc.tuning.constraints import ConstraintSet
+from apc.tuning.scenario_optimizer import _halton_points
 from apc.tuning.specification import TuningSpec, read_tradeoff, read_tuning_spec
 from tests.commands import Cli, write
 from tests.topologies import AVERAGE, MESH, TOPOLOGIES, compiled, messages_of, replaced, wall
@@ -206,6 +208,13 @@ def test_motions_die_out_no_faster_with_any_gains_of_a_grid() -> None:
         assert "±" in str(found) and "±" not in str(replace(found, error=math.inf))
     typed = {one.parameter: float(one.value) for one in found.gains}
     assert apc.analyze(compiled(AVERAGE), params=typed).spectral_radius < found.value
+
+
+@pytest.mark.parametrize("size", [1, 2, 7])
+def test_sample_points_are_the_sequence_of_halton(size: int) -> None:
+    """Against SciPy, whose sequence begins at the corner."""
+    expected = qmc.Halton(size, scramble=False).random(2049)[1:]
+    np.testing.assert_allclose(_halton_points(2048, size), expected, rtol=1e-15)
 
 
 def test_the_worst_point_of_a_box_is_on_a_ridge_and_at_an_edge() -> None:
