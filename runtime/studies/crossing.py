@@ -66,8 +66,8 @@ NEWTON, BRENT, HALVINGS = 12, 200, 60
 # relative to the value or the smallest size.
 INWARDS = 1e-9
 
-# The logarithm of a spectral radius that an analysis decides without matrices, and the multiple of its error
-# from the crossing at which the others are decided.
+# The logarithm of a spectral radius that is clearly off the circle: an analysis decides it without matrices.
+# The multiple of its error from the crossing at which verdicts are decided.
 AWAY, CLEARLY = 1e-9, 1.03
 
 # The radius is discontinuous in a bracket narrower than this, relative to the value, if it changes by more
@@ -430,7 +430,8 @@ def _first_samples(segment: SmoothSegment, *, first: bool) -> tuple[_Samples, st
             samples = samples.merged(_samples_at(segment, np.array([point])))
         except ApcError as error:
             return samples, error.mistakes[0].message
-        if samples.log_radius[-1] >= 0 > samples.log_radius[0]:
+        # A sample next to the circle, as at a limit that is known already, is no end of a bracket.
+        if samples.log_radius[-1] > AWAY and samples.log_radius[0] < 0:
             break
     return samples, ""
 

@@ -11,7 +11,7 @@ import apc
 from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError
 from apc.lifting.numeric_model import numeric_model
-from apc.studies.margins import Margins, network_margins
+from apc.studies.margins import Margins, margins, network_margins
 from apc.studies.sensitivity import network_sensitivities
 from tests.bruteforce import TopologySource
 from tests.held_topologies import system_of, topology
@@ -146,3 +146,19 @@ def test_a_frame_that_grows_by_many_decades_is_unstable_and_what_lies_beyond_is_
             verdict = apc.mean_square_stability(model, params={"inside.damping": damping})
             assert verdict is not None and verdict.stable is False
     assert apc.critical(model, "inside.damping").value is not None
+
+
+def test_a_sample_at_the_limit_itself_is_no_end_of_the_search() -> None:
+    """A part that no packet reaches has its nominal margin over any network; a search from 0 samples it."""
+    post = "post: {type: SampledSpringDamper, a: lone, b: ground, stiffness: 0 N/m, damping: 0.5 N*s/m,"
+    text = replaced(
+        AVERAGE,
+        ("delay: 8 ms}", "delay: 8 ms, loss: 30 %}"),
+        ("masses:\n", "masses:\n  lone: {mass: 0.05 kg, damping: 30 N*s/m}\n"),
+        ("couplers:\n", f"couplers:\n  {post} clock: haptic, delay: 1 ms}}\n"),
+    )
+    numeric = numeric_model(compiled(text))
+    nominal = margins(numeric)
+    (expected,) = (row.value for row in nominal.rows if row.parameter == "post.stiffness")
+    (found,) = (row for row in network_margins(numeric, nominal).rows if row.parameter == "post.stiffness")
+    assert expected is not None and found.value == pytest.approx(expected, rel=1e-8)
