@@ -526,6 +526,13 @@ def test_a_crossing_on_an_end_of_a_cell_is_held_from_both_sides() -> None:
         assert abs(one.value - value) <= one.error < 1e-8 and one.proof != ESTIMATE
 
 
+def test_a_first_loss_of_stability_next_to_a_sample_is_held_from_both_sides() -> None:
+    """The sample at 10 is unstable by less than any analysis decides: it is no end of the bracket."""
+    found = search(Known(lambda at: 1 + (at - 10) / 1e3 + 2e-11, band=1e-10, slow=True), first=True)
+    (one,) = found.edges
+    assert abs(one.value - 10) <= one.error < 1e-6 and one.proof != ESTIMATE
+
+
 def test_a_search_for_the_first_loss_of_stability_evaluates_no_later_crossing() -> None:
     # Zeros of a cubic: stability is lost at 5, regained at 30 and lost again at 70.
     path = Known(lambda at: 1 + (at - 5) * (at - 30) * (at - 70) / 1e7, slow=False)
