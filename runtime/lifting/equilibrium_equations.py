@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import functools
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import casadi
@@ -38,12 +38,12 @@ from apc.lifting.start_parameters import start_parameters, start_units
 from apc.linearization.branch_conditions import find_switches, functions_of
 from apc.linearization.kinks import active_branches
 from apc.linearization.linearize import start_values
-from apc.support.threads import load_pool
 
 # Stiffness of the springs per unit mass in 1/s², from stiff to weak: 1 N at 0.1 kg moves 1 mm, and 100 km.
 SPRINGS = (1e4, 1e3, 1e2, 1e1, 1.0, 1e-2, 1e-4)
-# Relative tolerance of a root in SciPy: the last steps reach the rounding.
-ROOT_TOLERANCE = 1e-10
+# With springs a root is a residual of this size relative to the first, in at most this number of steps: the
+# last steps, without springs, reach the rounding.
+ROOT_TOLERANCE, MOST_STAGE_STEPS = 1e-10, 100
 # Singular values below this, relative to the largest, are directions without stiffness: the equations mix
 # N/m with numbers, and rounding leaves some 1e-15.
 RANK = 1e-12
@@ -372,16 +372,34 @@ def root_of(equations: EquilibriumEquations) -> Floats:
 
 def _with_weak_springs(equations: EquilibriumEquations) -> tuple[Floats, list[float]]:
     """Return the root with the weakest springs, and the norm of their forces at each stage with a root."""
-    root = load_pool("scipy.optimize").root
     z, forces = equations.start, [0.0]
     for stiffness in SPRINGS:
         stage = functools.partial(equations.with_springs, stiffness=stiffness)
-        before = np.linalg.norm(stage(z)[0])
-        if not np.isfinite(before):
+        if not np.isfinite(stage(z)[0]).all():
             break
-        solution = root(stage, z, jac=True, method="hybr", options={"xtol": ROOT_TOLERANCE})
-        # SciPy also reports no success where the residual is rounding only.
-        if np.linalg.norm(solution.fun) <= before:
-            z = solution.x
-            forces.append(stiffness * float(np.linalg.norm(equations.spring @ (z - equations.start))))
+        z = _newton(stage, z)
+        forces.append(stiffness * float(np.linalg.norm(equations.spring @ (z - equations.start))))
     return z, forces
+
+
+def _newton(function: Callable[[Floats], tuple[Floats, Floats]], z: Floats) -> Floats:
+    """Return the point (n,) of least residual of Newton's method for a piecewise smooth function.
+
+    Notes
+    -----
+    Full steps with the Jacobian at each point find the root of a piecewise linear monotone function, such as
+    the force of a contact. Methods that update one Jacobian over many steps stop at its kink.
+    """
+    first, best, least = np.nan, z, np.inf
+    for _ in range(MOST_STAGE_STEPS):
+        residual, slopes = function(z)
+        size = float(np.linalg.norm(residual))
+        if not np.isfinite(slopes).all() or not np.isfinite(size):
+            break
+        first = size if np.isnan(first) else first
+        if size < least:
+            best, least = z, size
+        if size <= ROOT_TOLERANCE * first:
+            break
+        z = z + np.linalg.lstsq(slopes, -residual, rcond=None)[0]
+    return best

@@ -231,7 +231,7 @@ def _reason_not_supported(system: Model, lossy: Sequence[tuple[Link, ChannelLaw]
     """Return the reason why a network is not supported, "" if it is supported."""
     if why := next((why for link, _ in lossy if (why := _other_coupling(system, link))), ""):
         return why
-    for link, _ in lossy:
+    for link in system.links:  # also where no packet is lost at the present values
         if link.graph.shape == "arcs" and (link.graph.arcs[:, 0] == link.graph.arcs[:, 1]).any():
             return f"packets of {link.name} that a peer sends to itself"
     if any(law.trace is not None for _, law in lossy):

@@ -337,6 +337,9 @@ def search(path: ParameterPath, *, first: bool = False, progress: Progress | Non
             complete = complete and segment.high == segment.low
             undecided.append((float(segment.low), float(segment.high)))
             continue
+        beyond = segment.points[segment.points > samples.points[-1]]
+        if segment.slow and not first and len(beyond):
+            undecided.append((float(samples.points[-1]), float(beyond[-1])))
         samples, isolated_ends = _with_inner_ends(segment, samples)
         isolated += isolated_ends
         stable_at = (samples.log_radius < 0).tolist()

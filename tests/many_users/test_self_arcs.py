@@ -65,6 +65,13 @@ def test_its_losses_are_not_judged() -> None:
     assert found.stable is None and "a peer sends to itself" in str(found)
 
 
+def test_without_losses_they_are_not_judged_in_mean_square_either() -> None:
+    """At a loss of 0 the packets were left out, and the growth was that of the peer alone."""
+    model = compiled(topology(loss=", loss: 20 %"))
+    (value,) = apc.sweep(model, {"lan.loss": [0]}, criterion="mean-square", jobs=1).column("verdict")
+    assert value == "not judged"
+
+
 @pytest.mark.needs_extension("loss_models")
 def test_its_losses_in_a_row_are_those_by_hand() -> None:
     """All patterns of twelve frames, without the free translation."""

@@ -533,6 +533,11 @@ def test_a_first_loss_of_stability_next_to_a_sample_is_held_from_both_sides() ->
     assert abs(one.value - 10) <= one.error < 1e-6 and one.proof != ESTIMATE
 
 
+def test_values_without_a_verdict_at_the_end_of_a_range_are_undecided() -> None:
+    found = search(Known(lambda at: 0.9 if at < 60 else math.nan))
+    assert found.undecided == ((50.0, 100.0),) and found.searched_to == (0.0, 50.0)
+
+
 def test_a_search_for_the_first_loss_of_stability_evaluates_no_later_crossing() -> None:
     # Zeros of a cubic: stability is lost at 5, regained at 30 and lost again at 70.
     path = Known(lambda at: 1 + (at - 5) * (at - 30) * (at - 70) / 1e7, slow=False)

@@ -50,6 +50,17 @@ hands: {{push: {{type: ConstantForce, flange: device, force: {force} N}}}}
 """
 
 
+AWAY = """\
+topology: away
+clocks: {haptic: 1 ms}
+peers: {user: {count: 1}}
+masses: {device: {mass: 0.2 kg, damping: 2 N*s/m}}
+couplers:
+  wall: {type: VirtualWall, flange: device, position: 10 mm, stiffness: 1000 N/m, clock: haptic}
+hands: {push: {type: ConstantForce, flange: device, force: 3 N}}
+"""
+
+
 def positions(point: apc.OperatingPoint) -> dict[str, float]:
     return {position.name: position.value for position in point.positions}
 
@@ -70,6 +81,22 @@ def test_a_wall_carries_the_force_beyond_its_surface() -> None:
     point = apc.operating_point(compiled(WALL.format(force=5)))
     assert positions(point) == {"device.x": pytest.approx((5 + 1000 * 0.004) / 1250, rel=1e-14)}
     assert dict(point.active) == {"wall.push": True}
+
+
+@pytest.mark.parametrize("stiffness", [1e2, 5e3, 1e6])
+@pytest.mark.parametrize("distance", [0.001, 0.01, 0.4])
+def test_a_free_body_is_pushed_to_a_wall_at_any_distance(distance: float, stiffness: float) -> None:
+    """At rest the wall carries the force: x = d + F/k, from a start in free space."""
+    system = compiled(AWAY)
+    for force, mass in ((0.5, 0.05), (3.0, 1.0), (20.0, 0.2)):
+        values = {
+            "wall.position": distance,
+            "wall.stiffness": stiffness,
+            "push.force": force,
+            "device.mass": mass,
+        }
+        found = positions(apc.operating_point(apc.set_parameters(system, values)))["device.x"]
+        assert found == pytest.approx(distance + force / stiffness, rel=1e-9)
 
 
 def test_a_contact_that_is_pulled_open_is_off() -> None:
