@@ -9,8 +9,8 @@ Does not: read the instants (see `peer_times`).
 At the start of the frame of a change, in this order:
 
 1. The peers that leave are removed, with all their packets, also those in transit.
-2. Each peer that joins has its start values. The states of its parts in `PeerType.joining` are the means of
-   those of all peers that stay, their stored values the means of those of its group.
+2. Each peer that joins has its start values. The states and stored values of its parts in `PeerType.joining`
+   are the means of those of the peers of its group that stay; without any, its states are means over all.
 3. The packets of a peer that joins are, at each instant of sending, the mean m of the packets of the peers of
    its group that stay, shifted to its own values: m + s(own values) − mean of s(values of the others), where
    s gives the sent values. If all its sent values are means, so are its packets.
@@ -279,21 +279,22 @@ def _set_joining_values(
 ) -> None:
     """Set the rows of a carry that belong to the parts in `PeerType.joining`, at the joining peers.
 
-    States are the means over all groups, other stored values the means over the peers of the group.
+    They are the means over the peers of the group that stay, as `apc analyze --changing` assumes; without
+    any, states are the means over all groups.
     """
     peer_type, layout = member.program.peer_type, member.program.layout
-    for row, state in enumerate(peer_type.states):
-        if peer_type.joins_at_mean(state.name) and state.name in means:
-            carry[row, joining] = means[state.name]
     partitions = {partition.clock: partition for partition in peer_type.clocks}
     names = [
+        *(state.name for state in peer_type.states),
         *(peer_type.clocks[partition].outputs[output] for partition, output in layout.outputs),
         *(partitions[hold.clock].outputs[hold.output] for hold in peer_type.holds),
         *(peer_type.clocks[value.partition].outputs[value.output] for value in layout.later_values),
     ]
-    for row, name in enumerate(names, layout.states):
+    for row, name in enumerate(names):
         if peer_type.joins_at_mean(name) and len(staying):
             carry[row, joining] = carry[row, staying].mean()
+        elif peer_type.joins_at_mean(name) and row < layout.states and name in means:
+            carry[row, joining] = means[name]
 
 
 def _sent(member: GroupProgram, carry: Floats, link: str, channel: str, seconds: float) -> Floats:
