@@ -76,6 +76,7 @@ from apc.studies.stability_criteria import (
     criterion_of,
     line_points,
     refuse_timing_parameter,
+    scale_of,
     verdict_with,
 )
 from apc.studies.timing_values import is_scaled, reaches_period, refuse_phase
@@ -421,7 +422,7 @@ def _pointwise_path(
 ) -> PointwisePath:
     """Return the path along a parameter by analyses, value by value."""
     system = numeric.model
-    points, least = line_points(system, parameter_ref, *ends, value_now(system, parameter_ref) or 1.0)
+    points, least = line_points(system, parameter_ref, *ends, scale_of(system, parameter_ref))
     return PointwisePath(radius_evaluator(numeric, (parameter_ref,), _LOCATION, criterion), points, least)
 
 

@@ -55,6 +55,7 @@ from apc.studies.stability_criteria import (
     RadiusEvaluator,
     allowed,
     line_points,
+    scale_of,
 )
 from apc.studies.timing_values import delay_now
 from apc.support.threads import single_threaded
@@ -164,7 +165,12 @@ def margins(numeric: NumericModel, *, quick: bool = False, analysis: Analysis | 
             return Margins((), "none: the topology has no motion")
         paths = _margin_paths(numeric, () if slow else linearized, searched)
         rows = [
-            _margin(system, parameter_ref, stable_in_all([search(path, first=True) for path in of_parameter]))
+            _margin(
+                system,
+                parameter_ref,
+                stable_in_all([search(path, first=True) for path in of_parameter]),
+                pointwise=slow or not linearized,
+            )
             for parameter_ref, of_parameter in zip(searched, paths, strict=True)
             if of_parameter
         ]
@@ -240,7 +246,7 @@ def _margin_paths(
         most = allowed(system, parameter_ref)[1]
         if not linearized:
             source = RadiusEvaluator(numeric, (parameter_ref,), LOCATION, NOMINAL)
-            points, least = _margin_points(system, parameter_ref, abs(present) or 1.0)
+            points, least = _margin_points(system, parameter_ref, abs(scale_of(system, parameter_ref)))
             yield [PointwisePath(source, points, least)] if points[-1] > present else []
             continue
         varied = nonzero if present else [parameter_ref]
@@ -288,9 +294,14 @@ def not_evaluated(system: Model, parameter_ref: ParameterRef, why: str) -> Margi
     return Margin(parameter_ref.label, unit, present, None, None, None, None, "", present, why)
 
 
-def _margin(system: Model, parameter_ref: ParameterRef, search: CrossingReport) -> Margin | None:
-    """Return the margin from a search, None if the radius does not depend on the parameter."""
-    if not search.has_effect:
+def _margin(
+    system: Model, parameter_ref: ParameterRef, search: CrossingReport, *, pointwise: bool = False
+) -> Margin | None:
+    """Return the margin from a search, None if no eigenvalue depends on the parameter.
+
+    A search that is `pointwise` knows the radius only, which may be that of another mode.
+    """
+    if not search.has_effect and not pointwise:
         return None
     present = value_now(system, parameter_ref)
     row = replace(not_evaluated(system, parameter_ref, ""), searched_to=search.searched_to[1])
@@ -364,7 +375,7 @@ def network_margins(numeric: NumericModel, nominal: Margins, *, quick: bool = Fa
             source = radius_evaluator(numeric, (item,), LOCATION)
             result = search(PointwisePath(source, points, least), first=True)
             evaluations += result.evaluations
-            rows.append(_margin(system, item, result))
+            rows.append(_margin(system, item, result, pointwise=True))
             if rows[-1] and result.why:
                 ended_early.setdefault(result.why, []).append(item.label)
             if rows[-1] and result.edges and result.edges[0].proof != BOUNDED[MEAN_SQUARE]:

@@ -2,7 +2,7 @@
 
 Takes: a `Model` and the name of a parameter, also of its links' losses.
 Gives: `MEAN_SQUARE`, `NOMINAL`, `PASSIVE`, `SCALAR_CRITERIA`, `criterion_of`, `refuse_timing_parameter`;
-`PointwisePath`, `line_points`, `BOUNDED`; `verdict_with`, `unbounded_verdict`, `allowed`;
+`PointwisePath`, `line_points`, `BOUNDED`; `verdict_with`, `unbounded_verdict`, `allowed`, `scale_of`;
 `RadiusEvaluator`.
 Guarantees: a verdict follows from bounds on the growth of second moments, or on the energy that passive hands
 can extract, expressed as a growth (see `absolute_stability.passivity_radius`); nominally, from the analysis
@@ -29,7 +29,7 @@ from apc.lifting.data_age import aged
 from apc.lifting.numeric_model import NumericModel
 from apc.network.nominal_criterion import channel_numbers, unreliable
 from apc.parameter_values.overrides import Override, apply
-from apc.parameter_values.parameter_names import ParameterRef, parameter_of, unit_of
+from apc.parameter_values.parameter_names import ParameterRef, parameter_of, unit_of, value_now
 from apc.studies.crossing import SingleSegment, SmoothSegment, Verdict
 from apc.studies.evaluator import dominant_in_floats, overrides_at, reaches_time
 from apc.studies.parameter_path import OPEN, SPAN, pointwise, spread, verdict_of
@@ -348,6 +348,15 @@ class PointwisePath(SingleSegment):
         yield SmoothSegment(
             low, high, self.points, self.least, sample_at, self.verdict_at, slow=True, quick_at=quick_at
         )
+
+
+def scale_of(system: Model, parameter_ref: ParameterRef) -> float:
+    """Return the value of a parameter; for 0, the largest magnitude of a parameter of its unit, else 1."""
+    if present := value_now(system, parameter_ref):
+        return present
+    unit = unit_of(system, parameter_ref.name)
+    others = (parameter for parameter in system.parameters if parameter.unit == unit)
+    return max((abs(parameter.value) for parameter in others), default=0.0) or 1.0
 
 
 def line_points(

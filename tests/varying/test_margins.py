@@ -22,7 +22,8 @@ from apc.studies.margins import Margin
 from apc.studies.parameter_path import DelayPath, MatrixPath, verdict_of
 from apc.studies.timing_values import delay_now
 from tests import bruteforce
-from tests.topologies import AVERAGE, TOPOLOGIES, compiled, replaced
+from tests.language.own import component
+from tests.topologies import AVERAGE, TOPOLOGIES, compiled, library, replaced
 from tests.truths import text_of
 from tests.varying.test_critical_values import HARD, PRESSED, stable_at
 
@@ -207,3 +208,22 @@ def test_the_search_of_a_delay_begins_with_the_analysis_at_the_present_value() -
     radius = 0.95717138962509  # of the brute-force matrix, without the translation
     assert values[0, 0] == known[present].radius == pytest.approx(radius, abs=1e-13)
     assert not path.rigid  # no other matrix was built
+
+
+def test_at_a_degenerate_kink_no_margin_is_lost(
+    tmp_path: Path,
+) -> None:
+    """With f = max(k x, q x), k = q = 0, each value is analyzed alone; another mode has the radius."""
+    part = component("f = max(K*sample(flange.x), Q*sample(flange.x))", "flange.f = hold(f)", variables="f=N")
+    numbers = "parameters:\n  Q: {unit: N/m, default: 0 N/m}\n"
+    text = (
+        "topology: tie\nclocks: {tick: 1 ms}\npeers: {user: {count: 1}}\n"
+        "masses: {device: {mass: 1 kg, damping: 20 N*s/m}, other: {mass: 1 kg, damping: 1 N*s/m}}\n"
+        "couplers:\n  own: {type: Own, flange: device, clock: tick, K: 0 N/m}\n"
+        "  spring: {type: SpringDamper, a: device, b: ground, stiffness: 100 N/m}\n"
+        "  slow: {type: SpringDamper, a: other, b: ground, stiffness: 1 N/m}\n"
+    )
+    system = compiled(text, library(tmp_path, part.replace("parameters:\n", numbers)))
+    rows = {row.parameter: row for row in apc.margins(system).rows}
+    assert {"own.K", "own.Q", "spring.stiffness", "slow.stiffness"} <= set(rows)
+    assert rows["own.K"].searched_to >= 1e5 or rows["own.K"].value is not None
