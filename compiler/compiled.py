@@ -419,26 +419,36 @@ class Group:
 class PeerTime:
     """The instant `at` in seconds at which a peer such as "user[4]" joins or leaves.
 
-    `line` and `column` are its location in the topology, 0 for an option.
+    `line` and `column` are its location in the topology, 0 for an option. `formula` is set if the instant
+    depends on parameters.
     """
 
     peer: str
     at: Fraction
     line: int = 0
     column: int = 0
+    formula: Formula | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Experiment:
     """The duration of a simulation in seconds (None if not given), and the seed of its random numbers.
 
-    `joins` and `leaves` are the peers that join after the start and leave before the end.
+    `joins` and `leaves` are the peers that join after the start and leave before the end. `formula` is set if
+    the duration depends on parameters.
     """
 
     duration: Fraction | None = None
     seed: int = 0
     joins: tuple[PeerTime, ...] = ()
     leaves: tuple[PeerTime, ...] = ()
+    formula: Formula | None = None
+
+    @property
+    def formulas(self) -> list[Formula]:
+        """The formulas of the duration, joins and leaves that depend on parameters."""
+        formulas = (self.formula, *(item.formula for item in self.joins + self.leaves))
+        return [formula for formula in formulas if formula is not None]
 
 
 @dataclass(frozen=True, slots=True)

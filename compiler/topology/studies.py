@@ -11,8 +11,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from fractions import Fraction
 
-from apc.compiler.compiled import Axis, Experiment, PeerTime
+from apc.compiler.compiled import Axis, Experiment, Formula, PeerTime
 from apc.compiler.components.component import NumberParameter
+from apc.compiler.language.evaluation import formula_of
 from apc.compiler.language.unit_text import format_dimension
 from apc.compiler.language.values import AlreadyReportedError, ScalarValue
 from apc.compiler.source.nodes import Mapping, Node, Scalar, Sequence
@@ -40,12 +41,12 @@ def read_experiment(root: MappingReader, numbers: NamedNumbers) -> Experiment:
     `numbers` reads the times.
     """
 
-    def duration(node: Node, subject: str) -> Fraction:
-        """Return the positive duration in seconds."""
+    def duration(node: Node, subject: str) -> tuple[Fraction, Formula | None]:
+        """Return the positive duration in seconds, and its formula."""
         value = numbers.read_time(node, subject, "s")
         if value.number <= 0:
             raise fault("E207", value.location, subject, "more than 0 s", str(value))
-        return value.number
+        return value.number, formula(value)
 
     def seed(node: Node, subject: str) -> int:
         """Return the seed of random numbers, an integer from 0 to 2^63 - 1."""
@@ -56,15 +57,17 @@ def read_experiment(root: MappingReader, numbers: NamedNumbers) -> Experiment:
 
     def peer_time(name: Scalar, node: Node) -> PeerTime:
         """Return the instant of one peer, in seconds."""
-        at = numbers.read_time(node, name.text, "s").number
-        return PeerTime(name.text, at, name.location.line, name.location.column)
+        at = numbers.read_time(node, name.text, "s")
+        return PeerTime(name.text, at.number, name.location.line, name.location.column, formula(at))
+
+    def formula(value: ScalarValue) -> Formula | None:
+        """Return the formula of a time, None if it depends on no parameter."""
+        return None if value.expression is None else formula_of(value.expression)
 
     section = _section(root, "experiment", EXPERIMENT, "{duration: 3 s}")
-    return Experiment(
-        section.read("duration", duration, None),
-        section.read("seed", seed, 0),
-        *(tuple(section.each(key, '{"user[3]": 1 s}', peer_time)) for key in ("joins", "leaves")),
-    )
+    lasts, follows = section.read("duration", duration, (None, None))
+    joins, leaves = (tuple(section.each(key, '{"user[3]": 1 s}', peer_time)) for key in ("joins", "leaves"))
+    return Experiment(lasts, section.read("seed", seed, 0), joins, leaves, follows)
 
 
 def _section(parent: MappingReader, key: str, keys: tuple[str, ...], fix: str) -> MappingReader:

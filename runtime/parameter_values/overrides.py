@@ -17,7 +17,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from apc.compiler.compiled import Group, Model, Parameter, Timing, group_count
+from apc.compiler.compiled import Experiment, Formula, Group, Model, Parameter, Timing, group_count
 from apc.compiler.errors import ApcError, Diagnostic, Mistakes, SourceLocation
 from apc.compiler.language.evaluation import exact_value
 from apc.compiler.peer_counts import peers_of, recounted
@@ -27,6 +27,7 @@ from apc.parameter_values.parameter_names import OVERRIDE, ParameterRef, find, u
 from apc.parameter_values.parameters import ParameterScope, columns_of, scope_of, with_times_of_groups
 
 N = TypeVar("N", Parameter, Timing)
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,6 +128,7 @@ def apply(system: Model, overrides: Sequence[Override]) -> Model:
         timings=tuple(_with_changed_value(timing, common, common_values) for timing in system.timings),
         groups=tuple(groups),
         within=tuple(axis for axis in system.within if axis.parameter not in common_values),
+        experiment=_changed_experiment(system, common),
     )
     if counts:
         compiled_system = recounted(compiled_system, counts, OVERRIDE)
@@ -164,6 +166,25 @@ def _with_changed_value(item: N, changed: Mapping[str, Fraction], given: Collect
     return replace(item, value=float(value), exact=value, formula=formula)
 
 
+def _changed_experiment(system: Model, changed: Mapping[str, Fraction]) -> Experiment:
+    """Return the experiment with the times that depend on changed values."""
+    experiment, holder = system.experiment, scope_of(system).holder
+
+    def time(formula: Formula | None, present: T) -> T | Fraction:
+        """Return a time in seconds by its formula, the present one if nothing changes it."""
+        if formula is None or changed.keys().isdisjoint(formula.names):
+            return present
+        values = [changed[name] if name in changed else holder[name].number for name in formula.names]
+        return exact_value("experiment", formula, values)
+
+    joins, leaves = (
+        tuple(replace(item, at=time(item.formula, item.at)) for item in items)
+        for items in (experiment.joins, experiment.leaves)
+    )
+    duration = time(experiment.formula, experiment.duration)
+    return replace(experiment, duration=duration, joins=joins, leaves=leaves)
+
+
 def _check_times(
     system: Model, group: str, values: Sequence[Parameter], own_values: Mapping[str, Fraction]
 ) -> None:
@@ -179,6 +200,9 @@ def _check_times(
     changed = _with_dependents(scope_of(system, [*values, *system.timings]), own_values)
     shared = {timing.name: "a time common to all groups" for timing in system.timings}
     shared |= {group_count(group.name): "a number of the topology" for group in system.groups}
+    shared |= {
+        name: "a number of the topology" for formula in system.experiment.formulas for name in formula.names
+    }
     for name, meant in shared.items():
         if name in changed:
             message = f"{name} is {meant}, but depends on a value of {group}"
@@ -212,6 +236,10 @@ def _check_bounds(system: Model) -> None:
         elif timing.value < 0:
             expected = "a time of 0 s or more"
             mistakes.add("E625", OVERRIDE, timing.name, expected=expected, got=got, subject=timing.name)
+    duration = system.experiment.duration
+    if duration is not None and duration <= 0:
+        expected, got = "a time above 0 s", _in_ms(duration)
+        mistakes.add("E625", OVERRIDE, "duration", expected=expected, got=got, subject="duration")
     seconds = {timing.name: timing.value for timing in system.timings}
     for clock in system.clocks:
         if not seconds[clock.phase] < seconds[clock.period] and seconds[clock.period] > 0:

@@ -242,6 +242,52 @@ def test_the_experiment_of_a_topology_has_joins_and_leaves(cli: Cli, tmp_path: P
     assert not (tmp_path / "x.run").exists()
 
 
+NAMED = """parameters: {late: 80 ms, early: 160 ms}
+experiment: {duration: 2*early, joins: {"user[3]": late}, leaves: {"user[1]": early}}
+"""
+
+
+@pytest.fixture
+def named(tmp_path: Path) -> Path:
+    """Return a topology whose instants and duration depend on parameters."""
+    path = tmp_path / "topology.yaml"
+    path.write_text(f"{AVERAGE.read_text(encoding='utf-8')}\n{NAMED}", encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize("is_compiled", [False, True])
+def test_instants_follow_the_parameters_they_depend_on(
+    named: Path, cli: Cli, tmp_path: Path, is_compiled: bool
+) -> None:
+    """The run is that of a topology with the changed instants as numbers."""
+    text = named.read_text(encoding="utf-8")
+    for old, number in (("2*early", "400 ms"), (": late", ": 120 ms"), (": early", ": 200 ms")):
+        text = text.replace(old, number)
+    (tmp_path / "numbers.yaml").write_text(text, encoding="utf-8")
+    assert cli("compile", str(named)).code == 0
+    source = named.with_suffix(".apc") if is_compiled else named
+    found = apc.simulate(source, params={"late": "120 ms", "early": "200 ms"}, impulse="user[2]")
+    expected = apc.simulate(tmp_path / "numbers.yaml", impulse="user[2]")
+    np.testing.assert_array_equal(found.values, expected.values)
+    assert np.isfinite(found["user[3].cube.x"]).sum() == 401 - 120
+    assert np.isfinite(found["user[1].cube.x"]).sum() == 200 and found.time[-1] == 0.4
+
+
+BAD_VALUES = {
+    "late=81_ms": r'E914 join of user\[3\]: expected the start .*, got 0.081 s. Try: "user\[3\]": 0.08 s',
+    "late=-8_ms": r"E914 join of user\[3\]: expected more than 0 s .*, got -0.008 s",
+    "early=0_s": r"E625 duration: expected a time above 0 s, got 0 ms",
+    "user.late=88_ms": r"E622 late is a number of the topology, but depends on a value of user",
+}
+
+
+@pytest.mark.parametrize("value", BAD_VALUES)
+def test_bad_values_of_instants_are_refused(value: str, named: Path, cli: Cli) -> None:
+    ran = cli("simulate", str(named), "--set", value.replace("_", " "))
+    assert ran.code == 1 and not ran.out
+    assert re.search(BAD_VALUES[value], " ".join(ran.err.split())), ran.err
+
+
 BAD = {
     "--joins user[4]=400_ms": r"E914 joins: .* of the topology .*, got user\[4\]. Try: --set user.count=4",
     "--joins user[0]=400_ms": r"E914 joins: expected a peer of the topology .*, got user\[0\]\.$",
