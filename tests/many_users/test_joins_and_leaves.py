@@ -12,6 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 import apc
+from apc.compiler.errors import ApcError
 from apc.network.packet_schedule import Timetable
 from apc.simulation.settings import Settings
 from apc.simulation.simulation import prepare
@@ -229,6 +230,14 @@ def test_files_have_gaps_where_a_peer_is_absent(cli: Cli, tmp_path: Path) -> Non
     assert '"joins_s": {\n      "user[3]": "2/25"' in reported.out
 
 
+def test_the_peer_of_a_group_of_one_needs_no_number(tmp_path: Path) -> None:
+    """Its join is understood, and refused since each group has a peer at every instant."""
+    path, text = tmp_path / "topology.yaml", AVERAGE.read_text(encoding="utf-8")
+    path.write_text(text.replace("{count: 3}", "{count: 2}\n  late: {count: 1}"), encoding="utf-8")
+    with pytest.raises(ApcError, match="E914 peers of late from 0 s on: expected at least 1, got 0"):
+        apc.simulate(path, duration="0.2 s", joins={"late": 0.08})
+
+
 def test_the_experiment_of_a_topology_has_joins_and_leaves(cli: Cli, tmp_path: Path) -> None:
     path = tmp_path / "topology.yaml"
     keys = 'experiment:\n  duration: 0.2 s\n  joins:\n    user[3]: 80 ms\n  leaves: {"user[1]": 160 ms}\n'
@@ -292,6 +301,8 @@ BAD = {
     "--joins user[4]=400_ms": r"E914 joins: .* of the topology .*, got user\[4\]. Try: --set user.count=4",
     "--joins user[0]=400_ms": r"E914 joins: expected a peer of the topology .*, got user\[0\]\.$",
     "--joins users[3]=400_ms": r"E914 joins: expected a peer of the topology .*, got users\[3\]",
+    "--joins user=400_ms": r'one peer of the group, .*, got user. Try: --joins "user\[1\]=0.4 s"',
+    "--leaves user=400_ms": r'E914 leaves: expected one peer .* Try: --leaves "user\[1\]=0.4 s"',
     "--joins user[3]=0_s": r"E914 join of user\[3\]: expected more than 0 s .*, got 0 s",
     "--joins user[3]=-1_s": r"E914 join of user\[3\]: expected more than 0 s .*, got -1 s",
     "--leaves user[3]=1_s": r"E914 leave of user\[3\]: .* less than the duration, 1 s, got 1 s",

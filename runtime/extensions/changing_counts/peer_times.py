@@ -150,10 +150,16 @@ def _check_links(system: Model, presence: Presence, mistakes: Mistakes) -> None:
 
 
 def _peer_of(system: Model, key: str, item: PeerTime) -> tuple[Group, int]:
-    """Return the group and the number, from 1, of a peer such as "user[2]"; "user" is "user[1]"."""
+    """Return the group and the number, from 1, of a peer such as "user[2]"; "user" is the peer of a group of
+    one.
+    """
     parsed = _PEER.fullmatch(item.peer.strip())
     groups = {group.name: group for group in system.groups}
     group = groups.get(parsed["group"]) if parsed else None
+    if parsed and group and group.count > 1 and not parsed["number"]:
+        expected = f"one peer of the group, {group.name}[1] to {group.name}[{group.count}]"
+        fix = _written(key, replace(item, peer=f"{group.name}[1]"), _s(item.at))
+        raise _fault(system, key, item, key, expected, group.name, fix)
     if parsed and group and 1 <= (number := int(parsed["number"] or 1)) <= group.count:
         return group, number
     known = ", ".join(f"{group.name}[1] to {group.name}[{group.count}]" for group in system.groups[:4])
