@@ -44,7 +44,7 @@ def analyze_command(
         type=click.IntRange(min=1),
         show_default="some seconds",
     ),
-    changing: str | None = option("Analyze changes of a number of peers.", "PATH=COUNTS"),
+    changing: tuple[str, ...] = option("Analyze changes of a number of peers.", "PATH=COUNTS"),
     every_convention: bool = option("Repeat for every order of simultaneous events.", name="--event-order"),
     margins: bool | None = option(
         "Compute all margins, or none.",
@@ -83,7 +83,10 @@ def analyze_command(
 
     if cells is not None and not box and hands in (*HANDS, PASSIVE):  # hands of the library make a box
         raise click.UsageError("--cells requires --box")
-    if changing is not None:
+    if len(changing) > 1:
+        message, advice = "--changing is given twice", "give one number of peers with all its counts"
+        raise ApcError(Diagnostic("E890", SourceLocation("--changing"), message, advice=advice))
+    if changing:
         given = {"--plot": plot is not None, "--box": bool(box), "--event-order": every_convention}
         given |= {"--limit-cycle": with_limit_cycle, "--certify": certify, "--method": method != AUTO}
         given |= {"--margins": margins is not None, "--nominal": nominal, "--modes": modes != "slowest"}
@@ -111,8 +114,8 @@ def analyze_command(
         return
     if hands not in HANDS:  # one of the library: all that were measured
         box = (*box, *(f"{name}={low}:{high}" for name, (low, high, _) in published(hands).items()))
-    if changing is not None:
-        print_result(_changing_counts(system, changing), as_json=as_json)
+    if changing:
+        print_result(_changing_counts(system, *changing), as_json=as_json)
         return
     ranges = _ranges(system, box)
     listed = sum(group.count for group in system.groups if group.columns)

@@ -113,6 +113,13 @@ def test_bad_counts_are_refused(text: str) -> None:
         apc.changing_counts(AVERAGE, text)
 
 
+@pytest.mark.parametrize("second", ["user.count=2:3", "contact.stiffness=2 N/m:3 N/m"])
+def test_the_option_is_given_once(second: str, cli: Cli) -> None:
+    ran = cli("analyze", str(AVERAGE), "--changing", "user.count=2:6", "--changing", second)
+    assert ran.code == 1 and not ran.out
+    assert " ".join(ran.err.split()).startswith("--changing: E890 --changing is given twice. Give one number")
+
+
 def test_peers_in_a_ring_are_not_interchangeable() -> None:
     with pytest.raises(ApcError, match=r"E890 .*equal peers that all receive each other"):
         apc.changing_counts(TOPOLOGIES / "ring-of-eight.yaml", "user.count=7:8")
