@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -98,19 +99,30 @@ def test_a_number_that_is_unstable_alone_is_named() -> None:
 
 BAD = {
     "contact.stiffness=2 N/m:3 N/m": r"E890 .*, got contact.stiffness. Try: .*user.count=2:10",
+    "device.mass=2:5": r'E890 .*, got device.mass. Try: --changing "user.count=2:10"',
     "user.count": r"E890 changing count: expected NAME=LOW:HIGH, got user.count",
-    "user.count=5:2": r"E881 range of user.count: expected the lower end first",
-    "user.count=2:2.5": r"E881 range of user.count: expected whole numbers",
-    "user.count=2:100": r'E890 user.count: expected at most 40 counts, got 99. Try: .* "user.count=2:41"',
-    "user.count=1:3": r"E8|E6",
+    "user.count=5:2": r'E881 .*: expected the lower end first, .* Try: --changing "user.count=2:5"',
+    "user.count=2:3.5": r'E881 .*: expected whole numbers, .* Try: --changing "user.count=2:3"',
+    "user.count=2.5, 4": r"E626 user.count: expected a whole number from 1 .*, got 2.5",
+    "user.count=2 kg:3 kg": r'E204 user.count: .* got 2 kg. Try: --changing "user.count=2:3"',
+    "user.count=2:5:1": r'E881 .* 2 values or more, got 1. Try: --changing "user.count=2:10"',
+    "user.count=2:100": r'E890 .*: expected at most 40 counts, got 99. Try: --changing "user.count=2:41"',
+    "user.count=1:3": r"E626 total number of peers: expected at least 2, .* got 1",
+    "user.count=0:4": r"E626 user.count: expected a whole number from 1 .*, got 0",
     "people=2:3": r"E622 people",
+    "users.count=2:3": r'E622 users.count .* Try: --changing "user.count=2:3"',
+    "peers=2:3": r'E623 peers .* Try: --changing "user.count=2:3"',
 }
 
 
 @pytest.mark.parametrize("text", BAD)
-def test_bad_counts_are_refused(text: str) -> None:
-    with pytest.raises(ApcError, match=BAD[text]):
+def test_bad_counts_are_refused_at_the_option(text: str) -> None:
+    with pytest.raises(ApcError) as caught:
         apc.changing_counts(AVERAGE, text)
+    [mistake] = caught.value.mistakes
+    assert re.match(f"--changing: {BAD[text]}", str(mistake)), mistake
+    if mistake.fix.endswith(('=2:3"', '=2:5"')):
+        assert apc.changing_counts(AVERAGE, mistake.fix.split('"')[1]).counts[0] == 2
 
 
 @pytest.mark.parametrize("second", ["user.count=2:3", "contact.stiffness=2 N/m:3 N/m"])

@@ -26,7 +26,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Any
 
@@ -41,7 +41,7 @@ from apc.compiler.timings import part
 from apc.lifting.interval_arithmetic import MIDPOINT_RADIUS, error_radius, value_of, with_error_radius
 from apc.lifting.numeric_model import NumericModel
 from apc.parameter_values.overrides import Override, apply
-from apc.parameter_values.parameter_names import ParameterRef
+from apc.parameter_values.parameter_names import ParameterRef, find
 from apc.result import Result
 from apc.spectrum.eigenpairs import largest_magnitudes
 from apc.spectrum.enclosure import enclose_eigenvalues
@@ -209,16 +209,37 @@ def _counts(numeric: NumericModel, name: str, values: str) -> tuple[ParameterRef
     if not values.strip():
         got = name or "nothing"
         raise ApcError(Diagnostic("E890", LOCATION, "changing count", "NAME=LOW:HIGH", got, fix))
-    axis = parse_axis(system, name, values)
-    if axis.free.name not in names:
-        expected = f"the number of peers of a group ({', '.join(names)})"
-        raise ApcError(Diagnostic("E890", LOCATION, "changing count", expected, name, fix))
-    counts = tuple(sorted(map(int, axis.values)))
-    if len(counts) > MOST_COUNTS:
-        fix = f'--changing "{name}={counts[0]}:{counts[0] + MOST_COUNTS - 1}"'
-        expected, got = f"at most {MOST_COUNTS} counts", str(len(counts))
-        raise ApcError(Diagnostic("E890", LOCATION, axis.free.label, expected, got, fix))
-    return axis.free, counts
+    try:
+        if find(system, name, LOCATION, counts=True).name not in names:
+            expected = f"the number of peers of a group ({', '.join(names)})"
+            raise ApcError(Diagnostic("E890", LOCATION, "changing count", expected, name, fix))
+        axis = parse_axis(system, name, values)
+        if len(axis.values) > MOST_COUNTS:
+            least, expected = min(axis.values), f"at most {MOST_COUNTS} counts"
+            got, fewer = str(len(axis.values)), f"{axis.free.name}={least}:{least + MOST_COUNTS - 1}"
+            raise ApcError(Diagnostic("E890", LOCATION, axis.free.label, expected, got, fewer))
+        for count in axis.values:
+            apply(system, [Override(axis.free, count)])
+    except ApcError as error:
+        raise _located(error, names, values, fix) from None
+    return axis.free, tuple(sorted(map(int, axis.values)))
+
+
+def _located(error: ApcError, names: Sequence[str], values: str, fix: str) -> ApcError:
+    """Return an error located at `--changing`, each fix with the option.
+
+    `names` are the possible parameters, `values` the given values; `fix` replaces a fix of another form.
+    """
+
+    def pasted(proposed: str) -> str:
+        """Return a fix as it is pasted."""
+        name, _, proposed_values = proposed.partition("=")
+        return f'--changing "{name}={proposed_values or values.strip()}"' if name in names else fix
+
+    return ApcError(
+        replace(mistake, location=LOCATION, fix=pasted(mistake.fix) if mistake.fix else "")
+        for mistake in error.mistakes
+    )
 
 
 def _matrices(
