@@ -1,4 +1,4 @@
-"""Limitations of an analysis of the nominal network: loss, jitter, recorded delays, ranges of delay.
+"""Limitations of an analysis of the nominal network: loss, jitter, recorded delays, ranges of delay, joins.
 
 Takes: a `Model`.
 Gives: `unreliable`, `chance`, `limitations`, `refuse_range`, `channel_numbers`, `refuse_channel_number`.
@@ -41,7 +41,7 @@ def chance(law: ChannelLaw) -> str:
 def limitations(
     system: Model, *, network: bool = True, varied: Collection[ParameterRef] = ()
 ) -> tuple[str, ...]:
-    """Return a note on each unreliable link, and on each delay that is given as a range.
+    """Return a note on each unreliable link, on joins and leaves, and on each delay that is given as a range.
 
     Parameters
     ----------
@@ -56,6 +56,8 @@ def limitations(
     for _, law in unreliable(system) if network else ():
         delay = _ms(Fraction(law.delay))
         notes.append(f"excluded: {chance(law)}; every packet has the nominal delay of {delay}")
+    if system.experiment.joins or system.experiment.leaves:
+        notes.append("excluded: the joins and leaves of the experiment; all peers are present")
     names = {parameter_ref.name for parameter_ref in varied}
     for interval in given_ranges(system):
         if interval.free.name not in names:

@@ -282,6 +282,13 @@ def test_instants_follow_the_parameters_they_depend_on(
     assert np.isfinite(found["user[1].cube.x"]).sum() == 200 and found.time[-1] == 0.4
 
 
+def test_an_analysis_states_that_all_peers_are_present(named: Path) -> None:
+    note = "excluded: the joins and leaves of the experiment; all peers are present"
+    analysis = apc.analyze(named)
+    assert note in " ".join(str(analysis).split()) and note not in str(apc.analyze(AVERAGE))
+    assert analysis.spectral_radius == apc.analyze(AVERAGE).spectral_radius
+
+
 BAD_VALUES = {
     "late=81_ms": r'E914 join of user\[3\]: expected the start .*, got 0.081 s. Try: "user\[3\]": 0.08 s',
     "late=-8_ms": r"E914 join of user\[3\]: expected more than 0 s .*, got -0.008 s",
