@@ -20,7 +20,7 @@ from apc.compiler.errors import Mistakes
 from apc.compiler.files import FileReader
 from apc.compiler.language.csv_tables import NamedFiles
 from apc.compiler.language.dimensions import DIMENSIONLESS, SECOND, Dimension
-from apc.compiler.language.expression import names
+from apc.compiler.language.expression import Call, NumberLiteral, names
 from apc.compiler.language.values import (
     PEERS,
     AlreadyReportedError,
@@ -184,7 +184,8 @@ class NamedNumbers:
             fix = f"{subject}: {node.text.strip().removeprefix('-')}" if rate.number else ""
             fix = "" if rate.expression else fix
             raise fault("E207", node.location, subject, "a rate above 0 Hz", brief(node.text), fix)
-        return ScalarValue(1 / rate.number, SECOND, None, rate.location)
+        expression = rate.expression and Call("/", (NumberLiteral(Fraction(1)), rate.expression))
+        return ScalarValue(1 / rate.number, SECOND, expression, rate.location)
 
     def read_for(self, node: Node, subject: str, item: Settable) -> ScalarValue:
         """Return the number of a node for a declared parameter, or the start value of a declared variable.

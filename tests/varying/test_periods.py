@@ -11,6 +11,7 @@ import apc
 from apc.analysis.analysis import analyze
 from apc.compiler.compiled import Model
 from apc.lifting.numeric_model import numeric_model
+from apc.parameter_values.overrides import apply, parse_override
 from apc.parameter_values.parameter_names import ParameterRef
 from apc.studies.timing_values import system_with_delay
 from tests.topologies import AVERAGE, compiled
@@ -130,3 +131,15 @@ def test_a_simple_ratio_of_two_clocks_is_not_taken_for_all_periods_near_it() -> 
 def test_an_upper_end_below_the_first_value_of_a_scan_is_kept() -> None:
     found = apc.critical(pulled(), "tick.period", upper="0.05 ms")
     assert found.searched_to[0] < found.searched_to[1] <= 0.05e-3
+
+
+def test_a_period_follows_a_rate_that_it_names() -> None:
+    """The end of the name is read as a unit of frequency."""
+    text = AVERAGE.replace("haptic: 1 ms", "haptic: rate_hz") + "\nparameters: {rate_hz: 1 kHz}\n"
+    model = compiled(text)
+    changed = apply(model, [parse_override(model, "rate_hz=500 Hz")])
+    periods = {timing.name: timing.value for timing in changed.timings}
+    assert periods["haptic.period"] == Fraction(1, 500)
+    direct = apply(model, [parse_override(model, "haptic.period=2 ms")])
+    radius = [analyze(numeric_model(system)).spectral_radius for system in (changed, direct)]
+    assert radius[0] == radius[1]
