@@ -217,8 +217,8 @@ class Parameter:
     `exact` is the rational number whose nearest float is `value`, such as 5/3; None if `value` was given as a
     float, which represents its shortest decimal. Times that depend on a parameter are computed from `number`,
     since the equality of times determines the order of events. `display_unit` is the unit in the topology and
-    in outputs, as Modelica's displayUnit; empty if it is `unit`. `choice` states that the value is one of
-    named values, such as a side, which does not vary continuously.
+    in outputs, as Modelica's displayUnit; empty if it is `unit`. `choices` are the named values of a
+    parameter that has no other values, such as a side.
     """
 
     name: str
@@ -231,7 +231,7 @@ class Parameter:
     description: str = ""
     exact: Fraction | None = None
     display_unit: str = ""
-    choice: bool = False
+    choices: tuple[tuple[str, float], ...] = ()
 
     @property
     def number(self) -> Fraction:

@@ -2,7 +2,7 @@
 
 Takes: numbers and texts.
 Gives: `WIDTH`, `cut`, `enumerated`, `counted`, `measured`, `known_digits`, `no_more`, `with_unit`,
-`in_hertz`, `time_text`, `wrapped`, `side_by_side`.
+`choices_text`, `choice_fixes`, `in_hertz`, `time_text`, `wrapped`, `side_by_side`.
 Guarantees: digits are limited by the error of a number; a line has at most `WIDTH` columns, except for a
 longer word.
 Does not: define messages, or print.
@@ -13,7 +13,7 @@ from __future__ import annotations
 import itertools
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from decimal import ROUND_FLOOR, ROUND_UP, Context, Decimal
 from fractions import Fraction
 
@@ -96,6 +96,16 @@ def time_text(seconds: float) -> str:
 def with_unit(number: str, unit: str) -> str:
     """Return a number with its unit; the number alone for the unit "1"."""
     return number if unit == "1" else f"{number} {unit}"
+
+
+def choices_text(values: Iterable[tuple[str, Fraction | float]], unit: str = "1", scale: float = 1) -> str:
+    """Return names with their values: `left (1) or right (-1)`; `scale` is the size of `unit` in SI units."""
+    return " or ".join(f"{name} ({with_unit(f'{float(value) / scale:g}', unit)})" for name, value in values)
+
+
+def choice_fixes(values: Iterable[tuple[str, Fraction | float]], before: str) -> str:
+    """Return a fix for each named value, with the text before it: `side: left, or side: right`."""
+    return ", or ".join(f"{before}{name}" for name, _ in values)
 
 
 def in_hertz(frequency: float) -> str:

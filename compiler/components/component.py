@@ -104,7 +104,9 @@ class NumberParameter:
     @property
     def bounds(self) -> Bounds:
         """The range of valid values."""
-        return Bounds(self.unit.text, self.unit.scale, self.minimum, self.exclusive_minimum, self.maximum)
+        return Bounds(
+            self.unit.text, self.unit.scale, self.minimum, self.exclusive_minimum, self.maximum, self.words
+        )
 
 
 @dataclass(frozen=True, slots=True)

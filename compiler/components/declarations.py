@@ -259,11 +259,11 @@ def _numbers(name: str, body: MappingReader) -> list[NumberParameter]:
         with mistakes:
             words[key.text] = _number(node, key.text, unit)
             check(words[key.text], node, f"option {key.text} of {first}")
+    template = replace(template, words=tuple(words.items()))
     defaults = _named_values(body, "default", name, unit, size, words)
     for text, default in defaults:
         check(default, nodes.get("default"), f"default of {text}")
-    word_values = tuple(words.items())
-    return [replace(template, name=text, default=default, words=word_values) for text, default in defaults]
+    return [replace(template, name=text, default=default) for text, default in defaults]
 
 
 def _unit_and_size(body: MappingReader, name: str) -> tuple[Unit, int]:

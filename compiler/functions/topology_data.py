@@ -358,7 +358,7 @@ def _of_part(
     parameter = _named(
         name, value, declared.description, least, most, exclusive_minimum=declared.exclusive_minimum
     )
-    return replace(parameter, choice=bool(declared.words))
+    return replace(parameter, choices=tuple((word, float(number)) for word, number in declared.words))
 
 
 def all_parameters(

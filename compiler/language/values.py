@@ -26,7 +26,7 @@ from apc.compiler.language.units import COMMON, parse_quantity, parse_unit, quan
 from apc.compiler.language.vectors import number_of
 from apc.compiler.source.nodes import Node, Scalar
 from apc.compiler.source.reading import brief, either_comma, fault, named, unknown, value_of
-from apc.compiler.wording import with_unit
+from apc.compiler.wording import choice_fixes, choices_text, with_unit
 
 PEERS = ("peers",)
 
@@ -90,16 +90,22 @@ class AlreadyReportedError(ApcError):
 
 @dataclass(frozen=True, slots=True)
 class Bounds:
-    """The range of a number, in SI units; `unit` and `scale` are the unit in messages."""
+    """The range of a number, in SI units; `unit` and `scale` are the unit in messages.
+
+    With `words`, only the values that they name are valid.
+    """
 
     unit: str
     scale: Fraction
     minimum: Fraction | None = None
     exclusive_minimum: bool = False
     maximum: Fraction | None = None
+    words: tuple[tuple[str, Fraction], ...] = ()
 
     def fault(self, number: Fraction) -> str:
         """Return the violated bound as text, empty if there is none."""
+        if self.words and number not in dict(self.words).values():
+            return choices_text(self.words, self.unit, float(self.scale))
         least = self.minimum
         if least is not None and (number < least or (self.exclusive_minimum and number == least)):
             shown = with_unit(self._shown(least), self.unit)
@@ -119,7 +125,7 @@ class Bounds:
             bounds.fault(value.number),
             with_unit(bounds._shown(value.number), bounds.unit),
         )
-        fix = ""
+        fix = choice_fixes(self.words, "" if subject.endswith("]") else f"{subject}: ")
         if value.unit and value.expression is None and value.number < 0 and not self.fault(-value.number):
             fix = got.removeprefix("-") if subject.endswith("]") else f"{subject}: {got.removeprefix('-')}"
         mistakes.add("E207", value.location, subject, expected=expected, got=got, fix=fix)
@@ -175,6 +181,9 @@ def read_binding(
     text, location = value_of(node, subject, f"1 {unit}".removesuffix(" 1")), node.location
     number, written_unit = dict(words).get(text), ""
     if number is None:
+        if words and text.isidentifier() and text not in names_known:
+            expected, fix = choices_text(words), choice_fixes(words, f"{subject}: ")
+            raise fault("E206", location, subject, expected, brief(text), fix)
         _refuse_marks(text, location, subject)
         _refuse_computed(text, location, subject, unit)
         _refuse_reciprocal(text, location, subject, unit, names_known)

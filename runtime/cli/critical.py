@@ -61,6 +61,7 @@ def critical_command(
     users. FILE is a topology or a compiled model.
     """
     from apc.inputs.open_model import open_topology
+    from apc.parameter_values.parameter_names import find, refuse_choices
     from apc.studies.critical_values import critical
 
     _check_order(path, file)
@@ -78,6 +79,7 @@ def critical_command(
         varied=(path, *over),
         notify=note_aside,
     )
+    refuse_choices(system, find(system, path, COMMAND, counts=True), COMMAND)
     if over:
         if plot is not None:
             raise click.UsageError("--plot can't be combined with --over")

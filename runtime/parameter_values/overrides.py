@@ -21,9 +21,9 @@ from apc.compiler.compiled import Experiment, Formula, Group, Model, Parameter, 
 from apc.compiler.errors import ApcError, Diagnostic, Mistakes, SourceLocation
 from apc.compiler.language.evaluation import exact_value
 from apc.compiler.peer_counts import peers_of, recounted
-from apc.compiler.wording import with_unit
+from apc.compiler.wording import choice_fixes, choices_text, with_unit
 from apc.parameter_values.display_units import DisplayUnit, as_shown
-from apc.parameter_values.parameter_names import OVERRIDE, ParameterRef, find, unit_of
+from apc.parameter_values.parameter_names import OVERRIDE, ParameterRef, choices_of, find, unit_of
 from apc.parameter_values.parameters import ParameterScope, columns_of, scope_of, with_times_of_groups
 
 N = TypeVar("N", Parameter, Timing)
@@ -57,7 +57,16 @@ def parse_override(system: Model, text: str) -> Override:
         raise ApcError(Diagnostic("E621", OVERRIDE, "override", "NAME=VALUE", text[:80], form))
     parameter_ref = find(system, name, OVERRIDE, counts=True, value=value)
     unit = unit_of(system, parameter_ref.name)
-    result = quantity(value, OVERRIDE, subject=name, unit=unit, before=f"{name}=")
+    choices = choices_of(system, parameter_ref)
+    if value in choices:
+        return Override(parameter_ref, Fraction(choices[value]))
+    try:
+        result = quantity(value, OVERRIDE, subject=name, unit=unit, before=f"{name}=")
+    except ApcError:
+        if not choices:
+            raise
+        expected, fix = choices_text(choices.items(), unit), choice_fixes(choices.items(), f"{name}=")
+        raise ApcError(Diagnostic("E624", OVERRIDE, name, expected, value[:80], fix)) from None
     return Override(parameter_ref, result.value)
 
 
@@ -255,7 +264,7 @@ def check_bounds(
     code: str = "E624",
     location: SourceLocation = OVERRIDE,
 ) -> None:
-    """Record a value below the minimum or above the maximum of a parameter.
+    """Record a value below the minimum or above the maximum of a parameter, or none of its named values.
 
     Parameters
     ----------
@@ -281,6 +290,12 @@ def check_bounds(
             code, location, name, expected=f"{expected} {shown(number)}", got=shown(value), subject=name
         )
 
+    if parameter.choices and value not in dict(parameter.choices).values():
+        expected, fix = (
+            choices_text(parameter.choices, parameter.unit),
+            choice_fixes(parameter.choices, f"{name}="),
+        )
+        mistakes.add(code, location, name, expected=expected, got=f"{value:g}", fix=fix, subject=name)
     if low is not None and parameter.exclusive_minimum and value <= low:
         out("more than", low)
     elif low is not None and value < low:

@@ -2,8 +2,8 @@
 
 Takes: a `Model` and a name such as `contact.stiffness`, `right.hand.force` or `links.lan.delay`.
 Gives: `ParameterRef`, `Range`, `proposed_range`, `proposed_range_of`, `find`, `overlap`, `is_named`,
-`named_times`, `times_of`, `parameter_of`, `value_now`, `unit_of`, `values_by_group`, `notes_for_all_groups`;
-`given_ranges`.
+`named_times`, `times_of`, `parameter_of`, `choices_of`, `refuse_choices`, `value_now`, `unit_of`,
+`values_by_group`, `notes_for_all_groups`, `given_ranges`.
 Guarantees: an unknown name raises an error with the nearest known one.
 Does not: read or change values.
 """
@@ -26,7 +26,7 @@ from apc.compiler.compiled import (
     group_count,
 )
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation, nearest
-from apc.compiler.wording import with_unit
+from apc.compiler.wording import choices_text, with_unit
 from apc.parameter_values.display_units import DisplayUnit, as_shown
 
 # The sections of a topology; the name of a parameter may start with its section.
@@ -259,6 +259,23 @@ def parameter_of(system: Model, parameter_ref: ParameterRef) -> Parameter:
             if group.name == parameter_ref.group and parameter.name == parameter_ref.name:
                 return parameter
     return next(parameter for parameter in system.parameters if parameter.name == parameter_ref.name)
+
+
+def choices_of(system: Model, parameter_ref: ParameterRef) -> dict[str, float]:
+    """Return the named values of a parameter, such as left: 1; empty for a parameter with other values."""
+    return {
+        word: value
+        for parameter in system.parameters
+        if parameter.name == parameter_ref.name
+        for word, value in parameter.choices
+    }
+
+
+def refuse_choices(system: Model, parameter_ref: ParameterRef, location: SourceLocation) -> None:
+    """Raise ApcError E831 for a parameter with named values, which has no range; `location` as of `find`."""
+    if choices := choices_of(system, parameter_ref):
+        message = f"{parameter_ref.label} has no range: its values are {choices_text(choices.items())}"
+        raise ApcError(Diagnostic("E831", location, message))
 
 
 def value_now(system: Model, parameter_ref: ParameterRef) -> float:

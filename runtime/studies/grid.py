@@ -21,7 +21,7 @@ from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.wording import with_unit
 from apc.parameter_values.overrides import Override, apply
-from apc.parameter_values.parameter_names import ParameterRef, find, unit_of
+from apc.parameter_values.parameter_names import ParameterRef, choices_of, find, unit_of
 from apc.studies.count_range import whole_range
 from apc.studies.evaluator import reaches_count
 from apc.support.option_value import Values, option_values, text_of, with_last_unit
@@ -151,6 +151,12 @@ def parse_axis(system: Model, name: str, given: Values, *, ends: bool = False) -
         values = _values_of_range(parameter_ref.label, unit, parts[:2], in_range.split(":")[2:], default)
     else:
         items = given.split(",") if isinstance(given, str) else given
+        choices = choices_of(system, parameter_ref)
+        named = [item.strip() if isinstance(item, str) else "" for item in items]
+        items = [
+            Fraction(choices[name]) if name in choices else item
+            for name, item in zip(named, items, strict=True)
+        ]
         values = _values_of_list(parameter_ref.label, unit, items)
     if is_count and (ends or in_range):
         values = _whole_numbers(parameter_ref.label, values, every=in_range.count(":") == 1 and not ends)

@@ -22,6 +22,7 @@ from apc.parameter_values.parameter_names import (
     find,
     proposed_range,
     proposed_range_of,
+    refuse_choices,
     times_of,
 )
 from apc.parameter_values.parameters import scope_of
@@ -124,6 +125,7 @@ def _parameter(system: Model, parameter_ref: ParameterRef, location: SourceLocat
         raise ApcError(
             Diagnostic("E831", location, message, fix="" if is_clock_timing else f"apc critical {name}")
         )
+    refuse_choices(system, parameter_ref, location)
     for item in system.groups:
         own_values = {value.name: value for value in item.values}
         columns = {column.name for column in item.columns}

@@ -216,7 +216,7 @@ def varied(system: Model) -> list[ParameterRef]:
         start for peer_type in system.peer_types for clock in peer_type.clocks for start in clock.starts
     }
     excluded = starts | channel_numbers(system)
-    excluded |= {parameter.name for parameter in system.parameters if parameter.choice}
+    excluded |= {parameter.name for parameter in system.parameters if parameter.choices}
     return [parameter_ref for parameter_ref in free_parameters(system) if parameter_ref.name not in excluded]
 
 
