@@ -7,6 +7,7 @@ Does not: analyze equations, or change the topology.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -56,6 +57,7 @@ def topology_warnings(
             message += "; simulate and export need a single delay"
             warnings.add("W275", entry.location, message)
     counts = {group.name: group.count for group in groups}
+    first_peer = dict(zip(counts, itertools.accumulate(counts.values(), initial=0), strict=False))
     for link in links:
         if link.channel is not None and link.channel.loses_all:
             loss = entries[link.name].body.get("loss")
@@ -68,7 +70,8 @@ def topology_warnings(
             if pair.channel is not None and pair.channel.loses_all:
                 message = f"every packet of {name} is lost, so no packet ever arrives"
                 warnings.add("W277", pair.location, message)
-            if pair.sender == pair.receiver and counts[pair.sender] == 1:
+            is_single = pair.sender == pair.receiver and counts[pair.sender] == 1
+            if is_single and [first_peer[pair.sender]] * 2 not in link.graph.arcs.tolist():
                 message = f"no packet of {name} is sent, as {pair.sender} has one peer"
                 warnings.add("W278", pair.location, message)
     outer = [part for part in parts if part.name.partition("[")[0] in entries and "." not in part.name]

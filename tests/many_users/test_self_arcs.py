@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 import apc
 from apc.compiler.errors import ApcError
-from tests.topologies import compiled
+from tests.topologies import compiled, replaced
 
 MASS, DAMPING, STIFFNESS = 0.1, 1.0, 100.0  # kg, N·s/m, N/m
 
@@ -96,3 +96,10 @@ def test_its_losses_in_a_row_are_those_by_hand() -> None:
 def test_one_peer_receives_only_over_an_arc_to_itself(graph: str) -> None:
     with pytest.raises(ApcError, match=r"E208|E213"):
         compiled(topology(graph))
+
+
+def test_a_pair_within_a_group_applies_to_the_packets_of_a_peer_to_itself() -> None:
+    pair = compiled(topology(loss=", pairs: {user: {user: {delay: 3 ms}}}"))
+    link = compiled(replaced(topology(), ("delay: 8 ms", "delay: 3 ms")))
+    radii = [apc.analyze(model).spectral_radius for model in (pair, link, compiled(topology()))]
+    assert pair.warnings == () and radii[0] == radii[1] != radii[2]
