@@ -87,7 +87,7 @@ class Table:
         return len(self.columns[0].numbers) if self.columns else 0
 
 
-def read_table(file: InputFile, named_at: SourceLocation) -> Table:
+def read_table(file: InputFile, named_at: SourceLocation, example: str = _EXAMPLE) -> Table:
     """Return the table in a CSV file of numbers below headings such as `device.mass [kg]`.
 
     Parameters
@@ -96,13 +96,15 @@ def read_table(file: InputFile, named_at: SourceLocation) -> Table:
         The file.
     named_at
         The location of its reference, for a file that cannot be read.
+    example
+        A heading, for messages.
 
     Raises
     ------
     ApcError
         E701 the file cannot be read, E702 a heading is invalid, E703 a row or cell is invalid.
     """
-    with open_table(file, named_at) as opened:
+    with open_table(file, named_at, example=example) as opened:
         headings = opened.headings
         cells, lines = opened.numbers(
             range(len(headings)), [plain_float] * len(headings), "cell", "a finite number"
@@ -161,8 +163,11 @@ class CsvReader:
             lines.append(location.line)
             if len(cells) != len(self.headings):
                 reason = f"row: expected {len(self.headings)} cells, one for each heading, got {len(cells)}"
-                mistakes.add("E703", location, reason)
+                advice = "separate cells by commas, not semicolons" if ";" in "".join(cells) else ""
+                mistakes.add("E703", location, reason, advice=advice)
                 faulty.add(location.line)
+                if advice:
+                    break
             else:
                 for column, number in zip(columns, readers, strict=True):
                     try:

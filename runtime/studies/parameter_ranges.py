@@ -45,7 +45,7 @@ def parse_range(system: Model, given: str | NamedValues, location: SourceLocatio
     Raises
     ------
     ApcError
-        E830 another form of text, E831 a parameter that cannot vary in a box, E833 invalid limits; the
+        E830 another form of text, E831 a parameter without a range, E833 invalid limits; the
         errors of `parameter_names.find` and `units.quantity`.
     """
     name, values = named_values(given)
@@ -118,7 +118,7 @@ def _parameter(system: Model, parameter_ref: ParameterRef, location: SourceLocat
         return Parameter(name, "s", float(times[name]), minimum=0.0, exact=times[name])
     if times_of(system, name) or name in scope_of(system).needed([*times]) or name not in common:
         message = (
-            f"{name} is a time or sets one; timing parameters can't be in a box, as the event order is "
+            f"{name} is a time or sets one; timing parameters have no range, as the event order is "
             "discontinuous in them"
         )
         is_clock_timing = any(name in (clock.period, clock.phase) for clock in system.clocks)
@@ -147,7 +147,7 @@ def _check_limits(
 
     `low` and `high` are the ends of the range in SI, `name` is the parameter as given.
     """
-    message, mistakes = f"box of {name}", Mistakes()
+    message, mistakes = f"range of {name}", Mistakes()
 
     def end_texts(*ends: Fraction | float) -> list[str]:
         """Return the ends of a range as texts with the parameter's unit."""

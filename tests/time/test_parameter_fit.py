@@ -361,6 +361,12 @@ FREE = {MASS: "0.05 kg:1 kg"}
             FREE,
             "E712 time: expected equal intervals of 0.5 ms, got 2 ms after row 1",
         ),
+        (
+            "0.002,1,0\n0.001,1,0\n0,1,0\n",
+            FREE,
+            "E712 time: expected increasing times, got a step of -1 ms. Sort the rows by time.",
+        ),
+        ("0;1;0\n0.001;1;0\n", FREE, "got 1. Separate cells by commas, not semicolons."),
         ("0,1,0\n", FREE, "E712 rows: expected two or more, got 1"),
         (f"0,1,0\n{ROW}\n", {}, "E714 no free parameter. Try: --free"),
         (
@@ -385,6 +391,14 @@ def test_an_unsuitable_recording_is_refused_with_one_message(
         apc.fit(compiled(HAND), path, free=free)
     (mistake,) = error.value.mistakes
     assert expected in str(mistake)
+
+
+def test_an_empty_recording_lacks_the_time(tmp_path: Path) -> None:
+    path = tmp_path / "push.csv"
+    path.touch()
+    with pytest.raises(ApcError, match="E702 the table has no headings") as error:
+        apc.fit(compiled(HAND), path, free=FREE)
+    assert error.value.mistakes[0].fix == "time [s]"
 
 
 @pytest.mark.parametrize(

@@ -205,13 +205,13 @@ def test_delays_that_are_harmless_while_constant_are_unstable_by_turns() -> None
         (
             AVERAGE,
             "contact.stiffness=5 N/m:1 N/m",
-            "E833 box of contact.stiffness: expected a lower limit below the upper, got 5 N/m to 1 N/m",
+            "E833 range of contact.stiffness: expected a lower limit below the upper, got 5 N/m to 1 N/m",
         ),
         (AVERAGE, "contact.stiffness=-5 N/m:1 N/m", "E833"),
         (
             AVERAGE,
             "device.mass=±200%",
-            "E833 lower end of the box of device.mass: expected more than 0 kg, got -0.1 kg. "
+            "E833 lower end of the range of device.mass: expected more than 0 kg, got -0.1 kg. "
             "Try: device.mass=0.003 kg:0.3 kg",
         ),
         (AVERAGE, "contact.delay=±1%", "E831 contact.delay is a time or sets one"),

@@ -96,7 +96,7 @@ def read_recording(path: Path) -> MeasuredTable:
 
 def _read_csv(path: Path) -> list[MeasuredColumn]:
     """Return the columns of a CSV file in SI."""
-    table = read_table(InputFile(path, FileReader()), SourceLocation(str(path)))
+    table = read_table(InputFile(path, FileReader()), SourceLocation(str(path)), EXAMPLE)
     return [MeasuredColumn(column.name, column.unit, column.numbers) for column in table.columns]
 
 
@@ -138,10 +138,14 @@ def _interval(path: Path, times: Floats) -> Fraction:
     if not len(steps):
         raise _recording_error(path, "E712", "rows", "two or more", f"{len(times)}")
     step = float(np.median(steps))
-    gaps = np.flatnonzero(np.abs(steps - step) > UNEVEN * abs(step))
+    if step <= 0:
+        got = f"a step of {1e3 * step:.6g} ms"
+        advice = "sort the rows by time"
+        raise _recording_error(path, "E712", "time", "increasing times", got, advice)
+    gaps = np.flatnonzero(np.abs(steps - step) > UNEVEN * step)
     got = f"{1e3 * steps[gaps[0]]:.6g} ms after row {gaps[0] + 1}" if len(gaps) else "a drift"
     mean = float(times[-1] - times[0]) / len(steps)
-    for limit in LIMITS if step > 0 and not len(gaps) else ():
+    for limit in LIMITS if not len(gaps) else ():
         interval = Fraction(mean).limit_denominator(limit)
         if np.abs(times - times[0] - np.arange(len(times)) * float(interval)).max() <= UNEVEN * mean:
             return interval
