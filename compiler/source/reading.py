@@ -119,7 +119,8 @@ def value_of(node: Node, key: str, example: str) -> str:
     The fix has the values of a list or mapping that was written instead, else the example.
     """
     values = list(dict.fromkeys(_texts_in(node))) or [example]
-    fix = ", or ".join(f"{key}: {value}" for value in values) if len(values) <= MOST_OFFERED else ""
+    pasted = f'"{key}"' if "[" in key else key  # a bracket ends a name within braces
+    fix = ", or ".join(f"{pasted}: {value}" for value in values) if len(values) <= MOST_OFFERED else ""
     return text_of(node, key, fix)
 
 

@@ -149,7 +149,10 @@ class PartReader:
         if component.receives_from_others and peers == 1 and not self._has_self_arcs():
             message = f"{name} receives from other peers"
             fix = f"at: [{', '.join(counts)}]" if len(counts) > 1 else f"{next(iter(counts))}: {{count: 2}}"
-            mistakes.add("E208", entry.location, message, expected="at least 2 peers", got="1", fix=fix)
+            advice = "" if len(counts) > 1 else "use graph: {arcs: [[1, 1]]} for a peer that sends to itself"
+            mistakes.add(
+                "E208", entry.location, message, expected="at least 2 peers", got="1", fix=fix, advice=advice
+            )
         if peer_limit and peers > peer_limit:
             expected, got = f"{peer_limit} peers", f"{peers:,}"
             advice = f"set count: {peer_limit}, or at: to groups of {peer_limit} peers in total"

@@ -21,7 +21,7 @@ from apc.compiler.components.parts import PartEntry
 from apc.compiler.errors import SourceLocation
 from apc.compiler.language.dimensions import SECOND
 from apc.compiler.language.grammar import parse_expression
-from apc.compiler.language.values import AlreadyReportedError, ScalarValue
+from apc.compiler.language.values import AlreadyReportedError, ScalarValue, is_quantity
 from apc.compiler.source.nodes import Node, Scalar, Sequence
 from apc.compiler.source.reading import MappingReader, fault, form, mapping_of
 from apc.compiler.topology.channels import ChannelDeclaration, keys_of_pairs, read_channel, read_pair_channel
@@ -215,6 +215,8 @@ class _PairReader:
         """Return a pair with its delay, which by default follows that of the link, and its channel."""
         name, subject = f"{self.link.name}.pairs.{sender}.{receiver}", f"the pair {sender} to {receiver}"
         fix = f"{receiver}: {{loss: 2 %}}"
+        if isinstance(node, Scalar) and is_quantity(node.text) and not node.text.endswith("%"):
+            fix = f"{receiver}: {{delay: {node.text}}}"
         body = MappingReader(mapping_of(node, subject, fix), PAIR, subject, self.numbers.mistakes)
         if not body.nodes:
             raise fault("E201", node.location, f"{subject}: nothing is given", fix=fix)

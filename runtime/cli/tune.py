@@ -8,6 +8,9 @@ Does not: compute.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import click
@@ -24,6 +27,20 @@ from apc.cli.options import (
 from apc.cli.progress import status_line
 from apc.cli.topology_writing import check_topology_name, write_values
 from apc.compiler.errors import ApcError
+
+
+@contextmanager
+def _without_criterion() -> Iterator[None]:
+    """Replace the fix `--criterion`, an option of other commands, by advice."""
+    try:
+        yield
+    except ApcError as error:
+        raise ApcError(
+            replace(mistake, fix="", advice="tune without losses and jitter")
+            if mistake.fix.startswith("--criterion")
+            else mistake
+            for mistake in error.mistakes
+        ) from None
 
 
 @command
@@ -103,7 +120,7 @@ def tune_command(
     if plot is not None and not tradeoff:  # an impossible picture is refused before the search
         panels_of(system, len(tuning_spec.free))
     if tradeoff:
-        with status_line() as progress:
+        with status_line() as progress, _without_criterion():
             weighed = require_extension("pareto_front").pareto_front(
                 system, tuning_spec, read_tradeoff(tradeoff), seconds=read_seconds(time), progress=progress
             )
@@ -111,7 +128,7 @@ def tune_command(
             write_picture(weighed.plot, plot)
         print_result(weighed, as_json=as_json, written=[plot])
         return
-    with status_line() as progress:
+    with status_line() as progress, _without_criterion():
         tuning = tune(system, tuning_spec, seconds=read_seconds(time), progress=progress)
     refused: ApcError | None = None
     if write is not None and tuning.feasible:

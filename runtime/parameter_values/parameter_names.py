@@ -156,11 +156,16 @@ def find(
     single_peer = _SINGLE_PEER.fullmatch(name)
     if single_peer is not None and single_peer["group"] in groups and single_peer["rest"] in parameters:
         raise _single_peer_error(system, single_peer, location, value)
-    if name not in known and rest in UNWRITTEN and any(link.name == first for link in system.links):
-        message = f"{written} is not in the topology"
-        raise ApcError(
-            Diagnostic("E622", location, message, fix=f"links: {{{first}: {{{rest}: {UNWRITTEN[rest]}}}}}")
-        )
+    link = next((link for link in system.links if link.name == first), None)
+    if name not in known and link is not None:
+        *pair, key = rest.split(".")
+        nested = [first, *pair, f"{key}: {UNWRITTEN.get(key)}"]
+        is_pair = len(pair) == 3 and pair[0] == "pairs" and groups.issuperset(pair[1:])
+        if is_pair and key == "delay":
+            nested[-1] = f"delay: {1000 * value_now(system, ParameterRef(link.delay)):.12g} ms"
+        if (key in UNWRITTEN and not pair) or (is_pair and key in (*UNWRITTEN, "delay")):
+            fix = f"links: {{{': {'.join(nested)}{'}' * len(nested)}"
+            raise ApcError(Diagnostic("E622", location, f"{written} is not in the topology", fix=fix))
     if name not in known:
         period = f"{name}.period"  # of a clock
         near = period if period in known else nearest(name, sorted(known))

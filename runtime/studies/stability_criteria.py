@@ -177,8 +177,8 @@ def verdict_with(
         message = f"no mean-square verdict: {result.why}"
         fix, advice = f"--criterion {NOMINAL}", ""
         if any(override.free.name in channel_numbers(numeric.model) for override in overrides):
-            fix = "apc simulate" if aged(numeric.model) else ""
-            advice = "" if fix else "narrow the range between --lower and --upper"
+            is_judged = not aged(numeric.model) and not mean_square_growth(numeric, bounded=False).why
+            fix, advice = ("", "narrow the range") if is_judged else ("apc simulate", "")
         raise ApcError(Diagnostic("E898", location, message, fix=fix, advice=advice))
     if not bounded:
         return unbounded_verdict(result.radius)

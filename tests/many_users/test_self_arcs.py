@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import itertools
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 import apc
+from apc.__main__ import run
 from apc.compiler.errors import ApcError
 from tests.topologies import compiled, replaced
 
@@ -103,3 +105,26 @@ def test_a_pair_within_a_group_applies_to_the_packets_of_a_peer_to_itself() -> N
     link = compiled(replaced(topology(), ("delay: 8 ms", "delay: 3 ms")))
     radii = [apc.analyze(model).spectral_radius for model in (pair, link, compiled(topology()))]
     assert pair.warnings == () and radii[0] == radii[1] != radii[2]
+
+
+@pytest.mark.parametrize(
+    ("words", "end"),
+    [
+        (["critical", "lan.loss"], "Try: apc simulate"),
+        (["critical", "pull.stiffness"], "Try: --criterion nominal"),
+        (["analyze", "--box", "pull.stiffness=±1%"], "Try: apc critical pull.stiffness --criterion nominal"),
+        (["analyze", "--box", "lan.loss=±1%"], "Try: apc simulate"),
+        (
+            ["tune", "--free", "pull.stiffness=1 N/m:9 N/m", "--maximize", "pull.stiffness"],
+            "Tune without losses and jitter.",
+        ),
+    ],
+)
+def test_a_refusal_proposes_what_the_command_has(
+    words: list[str], end: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """No range of losses has a verdict, and `apc tune` has no criterion."""
+    path = tmp_path / "loop.yaml"
+    path.write_text(topology(loss=", loss: 20 %"), encoding="utf-8")
+    assert run([*words, str(path)]) == 1
+    assert capsys.readouterr().err.strip().endswith(end)

@@ -239,7 +239,7 @@ def test_what_cannot_be_varied_is_refused_with_what_can() -> None:
     system = compiled(unreliable("loss: 1 %"))
     with pytest.raises(ApcError, match=r"E898 .* every packet of lan is lost") as error:
         apc.critical(system, "lan.loss", lower="99 %", upper="100 %")
-    assert error.value.mistakes[0].advice == "narrow the range between --lower and --upper"
+    assert error.value.mistakes[0].advice == "narrow the range"
     with pytest.raises(ApcError, match=r"E898 lan\.delay can't be varied in mean square"):
         apc.critical(system, "lan.delay")
     for name, value in (("lan.loss", "101 %"), ("lan.loss", "-1 %")):

@@ -296,3 +296,19 @@ def test_the_age_of_packets_is_known_if_pairs_differ_in_loss_only() -> None:
     groups = replaced(text, ("user: {count: 3}", "user: {count: 2}\n  far: {count: 1}"))
     lossy = replaced(groups, ("loss: 0 %", "loss: 0 %, pairs: {user: {far: {loss: 5 %}}}"))
     assert distance(compiled(lossy), compiled(groups)) < 1e-12
+
+
+@pytest.mark.parametrize(
+    ("name", "entry"),
+    [
+        ("far.lab.loss", "far: {lab: {loss: 0 %}}"),
+        ("far.lab.delay", "far: {lab: {delay: 2 ms}}"),
+        ("lab.far.jitter", "lab: {far: {jitter: 0 ms}}"),
+    ],
+)
+def test_a_pair_or_a_key_that_is_missing_is_not_another_one(name: str, entry: str) -> None:
+    """The pair from the lab has a delay and a loss; what is missing is written into the topology."""
+    system = compiled(replaced(PAIRS, (f", far: {{lab: {{{WAN}}}}}", "")))
+    with pytest.raises(ApcError, match=r"E622 .* is not in the topology") as error:
+        apc.set_parameters(system, {f"lan.pairs.{name}": "1 ms"})
+    assert error.value.mistakes[0].fix == f"links: {{lan: {{pairs: {{{entry}}}}}}}"

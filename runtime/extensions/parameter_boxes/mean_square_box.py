@@ -192,7 +192,9 @@ def _refuse_range(numeric: NumericModel, interval: Range) -> None:
     why = "" if message else mean_square_growth(numeric, bounded=False).why
     if message or why:
         text = f"no box is proved in mean square over {message}" if message else f"no box is proved: {why}"
-        fix = f"apc critical {interval.free.label} --criterion mean-square"
+        fix = f"apc critical {interval.free.label} --criterion {'nominal' if why else 'mean-square'}"
+        if why and interval.free.name in channel_numbers(system):
+            fix = "apc simulate"
         raise ApcError(Diagnostic("E898", LOCATION, text, fix=fix))
 
 
