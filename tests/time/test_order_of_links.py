@@ -19,7 +19,7 @@ from apc.__main__ import run
 from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError
 from tests.published.by_hand import growth, held, radius
-from tests.topologies import AVERAGE, ROOT, replaced
+from tests.topologies import AVERAGE, ROOT, compiled, library, replaced
 
 Floats = NDArray[np.float64]
 Relay = Callable[[str], Model]
@@ -187,3 +187,23 @@ def test_packets_of_positions_with_a_delay_are_the_same_in_both_orders(
         found.append(np.array([apc.analyze(model).spectral_radius, moments, *played.ravel()]))
     assert np.ptp(found[0]) > 0.1
     assert found[0] == pytest.approx(found[1], rel=1e-11, abs=1e-13)
+
+
+@pytest.mark.parametrize(("order", "tick"), [("after", 2), ("before", 3)])
+def test_the_relay_of_the_manual(order: str, tick: int, tmp_path: Path) -> None:
+    """A constant force K x from this tick on moves a free mass by K x/m T^2/2 until the next row."""
+    manual = (ROOT / "docs" / "reference" / "links.md").read_text(encoding="utf-8")
+    component = manual.partition("```yaml\ncomponent: Repeater\n")[2].partition("```")[0]
+    own = library(tmp_path, f"component: Repeater\n{component}")
+    text = (
+        "topology: chain\nclocks: {haptic: 1 ms}\npeers:\n  a: {count: 1, set: {device.x: 1 mm}}\n"
+        "  relay: {count: 1, set: {repeater.role: relay}}\n  b: {count: 1}\n"
+        "masses: {device: {mass: 0.1 kg, shared: false}}\ncouplers:\n"
+        "  repeater: {type: Repeater, object: device, stiffness: 100 N/m, clock: haptic, link: lan}\n"
+        "links: {lan: {clock: haptic, delay: 2 ms, "
+        f"order: {order}, graph: {{arcs: [[a, relay], [relay, b]]}}}}}}\n"
+    )
+    found = apc.simulate(compiled(text, own), duration="5 ms")
+    [column] = [k for k, signal in enumerate(found.signals) if signal.name == "b[1].device.x"]
+    assert not found.values[: tick + 1, column].any()
+    assert found.values[tick + 1, column] == pytest.approx(100 * MS / 0.1 * MS**2 / 2, rel=1e-9)
