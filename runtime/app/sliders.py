@@ -93,8 +93,8 @@ def sliders_of(system: Model) -> tuple[Slider, ...]:
     sliders = []
     for parameter_ref in free_parameters(system):
         parameter = parameter_of(system, parameter_ref)
-        if parameter_ref.name in starts and parameter.value == 0:
-            continue  # a start value of zero has no slider
+        if parameter.choices or (parameter_ref.name in starts and parameter.value == 0):
+            continue  # named values and start values of zero have no slider
         low, high = _bounds(system, parameter_ref)
         if low is None and high is None:
             low = _inherited_minimum(system, parameter_ref)

@@ -31,13 +31,13 @@ from apc.compiler.errors import ApcError
 
 @contextmanager
 def _without_criterion() -> Iterator[None]:
-    """Replace the fix `--criterion`, an option of other commands, by advice."""
+    """Replace the fix of E898, which is for other commands, by advice."""
     try:
         yield
     except ApcError as error:
         raise ApcError(
             replace(mistake, fix="", advice="tune without losses and jitter")
-            if mistake.fix.startswith("--criterion")
+            if mistake.code == "E898" and mistake.fix
             else mistake
             for mistake in error.mistakes
         ) from None

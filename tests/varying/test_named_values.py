@@ -8,6 +8,7 @@ import pytest
 
 import apc
 from apc.__main__ import run
+from apc.app.sliders import sliders_of
 from apc.parameter_values.overrides import apply, parse_override
 from apc.studies.grid import parse_axis
 from tests.topologies import ONE_MASS, compiled, messages_of, replaced
@@ -73,3 +74,8 @@ def test_a_dependent_value_is_checked() -> None:
 def test_named_values_have_no_range(path: str, words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert run([*words, path]) == 1
     assert f"E831 wall.side has no range: its values are {NAMES}." in capsys.readouterr().err
+
+
+def test_named_values_have_no_slider() -> None:
+    labels = {slider.label for slider in sliders_of(compiled(TEXT))}
+    assert "wall.stiffness" in labels and "wall.side" not in labels
