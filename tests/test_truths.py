@@ -149,6 +149,7 @@ LEFT_OUT = {
     ("sweep", "lossy-average"),  # asks another question: in mean square
     ("export", "very-long-delay"),
     ("box", "non-commensurate"),
+    ("determinant", "sixty-hertz-user"),  # a frame of 200 ms with the three rates of 1000, 125 and 60 Hz
 }
 
 LONG = {(method, "non-commensurate") for method in ("point", "dense", "many", "sweep", "certify")} | {

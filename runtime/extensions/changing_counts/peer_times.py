@@ -144,9 +144,11 @@ def _check_links(system: Model, presence: Presence, mistakes: Mistakes) -> None:
             if value not in allowed:
                 subject, got = f"{word} of {link.name} with joins or leaves", value.replace("arcs", "a list")
                 expected = " or ".join(allowed)
-                mistakes.add(
-                    "E914", location, subject, expected=expected, got=got, fix=f"{word}: {allowed[0]}"
-                )
+                if value == "arcs":
+                    how = {"advice": f"joins and leaves need one of these graphs of {link.name}"}
+                else:
+                    how = {"fix": f"{word}: {allowed[0]}"}
+                mistakes.add("E914", location, subject, expected=expected, got=got, **how)
 
 
 def _peer_of(system: Model, key: str, item: PeerTime) -> tuple[Group, int]:
