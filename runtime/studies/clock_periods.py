@@ -37,7 +37,7 @@ from apc.studies.crossing import ESTIMATE, PERIOD, Crossing, SmoothSegment, Verd
 from apc.studies.delay_segments import DelaySegment
 from apc.studies.parameter_path import OPEN, AnalyzedPath, pointwise, spread, verdict_of
 from apc.studies.timing_values import (
-    common_period,
+    base_value,
     delay_now,
     is_scaled,
     long_period_between,
@@ -119,7 +119,7 @@ class _AnyPeriodPath(AnalyzedPath):
     def change(self, before: SmoothSegment, after: SmoothSegment, *, stable_below: bool) -> Crossing:
         """Return the change between two periods, with a gap as small as the length of frames permits."""
         low, high = before.low, after.low
-        unit = common_period(self.system, self.free)
+        unit = base_value(self.system, self.free)
         verdicts = [self.verdict_at(low), self.verdict_at(high)]
         while True:
             third = (high - low) / 3

@@ -2,7 +2,7 @@
 
 Takes: a `Model` and a timing, or a parameter that a timing depends on.
 Gives: `system_with_delay`, `delay_now`, `timing_slopes`; `reaches_period`, `refuse_phase`, `is_scaled`;
-`nearest_period`, `periods_near`, `period_between`, `common_period`; `MOST_FRAME_TICKS`;
+`nearest_period`, `periods_near`, `period_between`, `base_value`; `MOST_FRAME_TICKS`;
 `long_period_between`.
 Guarantees: exact rationals of a second.
 Does not: analyze.
@@ -20,7 +20,7 @@ from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.multiples import common_divisor, common_multiple
 from apc.compiler.wording import with_unit
 from apc.parameter_values.overrides import Override, apply
-from apc.parameter_values.parameter_names import ParameterRef
+from apc.parameter_values.parameter_names import ParameterRef, unit_of
 from apc.parameter_values.parameters import resolve, scope_of
 
 # Ticks of all clocks in the longest frame that is analyzed: some tenths of a second each.
@@ -31,6 +31,8 @@ STEP = Fraction(1, 1009)
 TRIAL = 101
 # Shares of the distance between a period and the end of its interval, within which a long frame is searched.
 SHARES = (Fraction(1, 32), Fraction(1, 4), Fraction(1))
+# The units of rates.
+RATES = ("Hz", "1/s")
 # The largest number of matching digits of a replaced period; the number of cached periods.
 DIGITS, CACHE_SIZE = 9, 256
 
@@ -87,18 +89,19 @@ def refuse_phase(
 
 
 def is_scaled(system: Model, parameter_ref: ParameterRef, *, delays: bool = False) -> bool:
-    """Return whether all periods and phases are proportional to a number.
+    """Return whether the ratios of all periods and phases are the same at every value of a number.
 
-    With `delays`, the delays must be proportional, too.
+    With `delays`, those of the delays, too.
     """
     now, timings = delay_now(system, parameter_ref), resolve(system).timings
     names = _clock_times(system, phases=False) | _clock_times(system, phases=True)
-    doubled = resolve(system_with_delay(system, parameter_ref, 2 * now)).timings
-    slopes = timing_slopes(system, parameter_ref)
-    return all(
-        timings[name] == slopes[name] * now and doubled[name] == 2 * timings[name]
-        for name in (timings if delays else names)
-    )
+    first = system.clocks[0].period
+    for value in (2 * now, now + STEP):
+        changed = resolve(system_with_delay(system, parameter_ref, value)).timings
+        factor = changed[first] / timings[first]
+        if any(changed[name] != factor * timings[name] for name in (timings if delays else names)):
+            return False
+    return True
 
 
 def _frame_ticks(system: Model, parameter_ref: ParameterRef, value: Fraction) -> float:
@@ -126,11 +129,18 @@ def _simplest_fraction(low: Fraction, high: Fraction) -> Fraction:
     return whole + 1 / _simplest_fraction(1 / (high - whole), 1 / (low - whole))
 
 
-def common_period(system: Model, parameter_ref: ParameterRef) -> Fraction:
-    """Return the common divisor in seconds of the constant periods; analysed periods are fractions of it."""
+def base_value(system: Model, parameter_ref: ParameterRef) -> Fraction:
+    """Return the value in SI whose multiples by simple fractions lead to short frames.
+
+    It is the common divisor of the constant periods for a time, its inverse for a rate, 1 for another number,
+    and the present value if there is no constant period.
+    """
     slopes, timings = timing_slopes(system, parameter_ref), resolve(system).timings
     fixed = [timings[name] for name in _clock_times(system, phases=False) if not slopes[name]]
-    return common_divisor(fixed) if fixed else delay_now(system, parameter_ref)
+    if not fixed:
+        return delay_now(system, parameter_ref)
+    unit, divisor = unit_of(system, parameter_ref.name), common_divisor(fixed)
+    return divisor if unit == "s" else 1 / divisor if unit in RATES else Fraction(1)
 
 
 def period_between(
@@ -143,9 +153,9 @@ def period_between(
     system, parameter_ref
         The compiled model and the number that varies.
     unit
-        The common divisor of the periods from `common_period`, in seconds.
+        The value from `base_value`.
     low, high
-        The two values, in seconds.
+        The two values in SI.
     """
     value = unit * _simplest_fraction(low / unit, high / unit)
     return value if _frame_ticks(system, parameter_ref, value) <= MOST_FRAME_TICKS else None
@@ -188,7 +198,7 @@ def nearest_period(system: Model, parameter_ref: ParameterRef, value: Fraction) 
         return value
     if _frame_ticks(system, parameter_ref, value) <= MOST_FRAME_TICKS:
         return value
-    unit = common_period(system, parameter_ref)
+    unit = base_value(system, parameter_ref)
     for digits in range(DIGITS, 0, -1):
         error_bound = value / 10**digits
         near = period_between(system, parameter_ref, unit, value - error_bound, value + error_bound)
@@ -200,9 +210,9 @@ def nearest_period(system: Model, parameter_ref: ParameterRef, value: Fraction) 
 def periods_near(
     system: Model, parameter_ref: ParameterRef, targets: Sequence[Fraction], location: SourceLocation
 ) -> list[Fraction]:
-    """Return periods of a clock near some values, in ascending order, each with a frame of allowed length.
+    """Return values of a period or rate near some values, ascending, each with a frame of allowed length.
 
-    They are, near each value between the first and the last, the period in the simplest ratio to the constant
+    They are, near each value between the first and the last, the one in the simplest ratio to the constant
     periods, and on either side of it one in a ratio so complex that its frame has nearly
     `MOST_FRAME_TICKS` ticks (see `long_period_between`). The first and the last value are included
     unchanged if their frames are short.
@@ -212,7 +222,7 @@ def periods_near(
     system, parameter_ref
         The compiled model and the number that varies.
     targets
-        The values in ascending order, in seconds.
+        The values in ascending order, in SI.
     location
         The location of the number, for messages.
 
@@ -221,7 +231,7 @@ def periods_near(
     ApcError
         E844 fewer than two periods have a frame of at most `MOST_FRAME_TICKS` ticks.
     """
-    unit = common_period(system, parameter_ref)
+    unit = base_value(system, parameter_ref)
     periods = {
         value
         for value in (targets[0], targets[-1])
@@ -241,11 +251,12 @@ def periods_near(
                     periods.add(long_period)
                     break
     if len(periods) < 2:
-        span = " to ".join(with_unit(f"{float(end):g}", "s") for end in (targets[0], targets[-1]))
+        si_unit = str(unit_of(system, parameter_ref.name))
+        span = " to ".join(with_unit(f"{float(end):g}", si_unit) for end in (targets[0], targets[-1]))
         message = (
-            f"periods of {parameter_ref.label} from {span} lead to frames of more than "
+            f"values of {parameter_ref.label} from {span} lead to frames of more than "
             f"{MOST_FRAME_TICKS:,} ticks with the other clocks"
         )
-        advice = f"use a range around a multiple of {with_unit(f'{float(unit):g}', 's')}"
+        advice = f"use a range around a multiple of {with_unit(f'{float(unit):g}', si_unit)}"
         raise ApcError(Diagnostic("E844", location, message, advice=advice))
     return sorted(periods)

@@ -30,10 +30,12 @@ couplers:
 """
 
 
-def pulled(delay_ms: int = 0, clocks: str = "", other: str = "", delay: str = "") -> Model:
+def pulled(
+    delay_ms: int = 0, clocks: str = "", other: str = "", delay: str = "", tick: str = "2 ms"
+) -> Model:
     """Return a position pulled back: x⁺ = x − p (T − d) x − p d x(a tick ago), stable below 2/p + 2 d."""
     return built(
-        f"topology: pulled\nclocks: {{tick: 2 ms{clocks}}}\npeers: {{user: {{count: 1}}}}\n"
+        f"topology: pulled\nclocks: {{tick: {tick}{clocks}}}\npeers: {{user: {{count: 1}}}}\n"
         f"masses:\n  it: {{type: Late, pull: {PULL!r} Hz, growth: 0 Hz, clock: tick, "
         f"delay: {delay or f'{delay_ms} ms'}}}\n{other}"
     )
@@ -51,6 +53,27 @@ def test_one_clock_has_the_largest_period_of_the_closed_form(delay_ms: int) -> N
     assert found.value == pytest.approx(2 / PULL + 2e-3 * delay_ms, rel=1e-12)
     assert found.error is not None and found.error < 1e-11 * found.value
     assert [one.stable_side for one in found.crossings] == ["below"]
+
+
+@pytest.mark.parametrize("beside", [False, True])
+@pytest.mark.parametrize(
+    ("tick", "declared", "limit"),
+    [
+        ("1/f", "f: 500 Hz", PULL / 2),
+        ("n*step", "{n: 1, step: 2 ms}", 1e3 / PULL),
+        ("2*t", "t: 1 ms", 1 / PULL),
+    ],
+)
+def test_a_number_on_which_the_period_depends_has_the_same_limit(
+    tick: str, declared: str, limit: float, *, beside: bool
+) -> None:
+    other = "  that: {type: Late, pull: 1 Hz, growth: 0 Hz, clock: other, delay: 0 ms}\n" * beside
+    parameters = "parameters: {" + declared.strip("{}") + "}\n"
+    system = pulled(0, ", other: 3 ms" * beside, other + parameters, tick=tick)
+    found = apc.critical(system, declared.strip("{")[0])
+    (one,) = found.crossings
+    assert abs(one.value - limit) <= one.error <= (2e-3 if beside else 1e-11) * limit
+    assert one.stable_side == ("above" if tick == "1/f" else "below")
 
 
 @pytest.mark.parametrize("period", ["1 ms", "3 ms"])
@@ -78,7 +101,7 @@ def test_the_textbook_wall_with_passive_hands_has_its_longest_period() -> None:
 def test_periods_of_too_long_frames_are_refused_by_name() -> None:
     system = alongside("1 ms")
     with pytest.raises(
-        apc.ApcError, match=r"E844 periods of tick\.period from .* lead to frames of more than"
+        apc.ApcError, match=r"E844 values of tick\.period from .* lead to frames of more than"
     ):
         apc.critical(system, "tick.period", lower="2.00011 ms", upper="2.00012 ms")
 
