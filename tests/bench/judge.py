@@ -92,7 +92,7 @@ class Judge:
         print(f"\n{work}")
         for one in programs:
             words = [f"  {one.program:<36}{time_of(one.seconds):>9}", f"{one.seconds / ours.seconds:9.3g}"]
-            words.append(f" {one.told(unit)}")
+            words.append(f" {one.report_of(unit)}")
             if one.error is not None and one.bound is not None:
                 words.append(self.within(f"{work}, {one.program}", one.error, one.bound))
             if one is ours and most_s is not None:
@@ -104,8 +104,8 @@ class Judge:
                 )
             print(" ".join(words))
             if not one.program.startswith("apc"):
-                cells = [work, time_of(ours.seconds), ours.told(unit), one.program, time_of(one.seconds)]
-                cells += [one.told(unit), f"{ours.seconds / one.seconds:.3g}"]
+                cells = [work, time_of(ours.seconds), ours.report_of(unit), one.program, time_of(one.seconds)]
+                cells += [one.report_of(unit), f"{ours.seconds / one.seconds:.3g}"]
                 self.rows.append(f"{ROW}{' | '.join(cells)} |")
 
     @property
