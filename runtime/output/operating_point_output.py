@@ -32,7 +32,7 @@ def rest_lines(result: OperatingPoint, *, most: int = MOST_POSITIONS) -> Lines:
     if len(shown) < len(result.positions):
         yield f"  … {len(result.positions) - len(shown)} more: apc.operating_point"
     on, off = (", ".join(name for name, active in result.active if active is side) for side in (True, False))
-    residual = f"{quantity(result.residual, result.residual_unit, 2)} (tolerance {result.tolerance:.2g})"
+    residual = f"below {quantity(result.tolerance, result.residual_unit, 2)}"
     yield from labelled(("on", on), ("off", off), ("residual", residual))
 
 

@@ -11,6 +11,7 @@ import re
 import shlex
 from collections.abc import Iterator, Mapping
 from itertools import product
+from pathlib import Path
 
 import click
 import pytest
@@ -92,10 +93,12 @@ def _fixes() -> Iterator[tuple[str, str]]:
         if isinstance(scope, ast.FunctionDef)
     ]
     # By each function with a parameter `fix` its place among the arguments.
-    places = {"Diagnostic": 5}
-    for _, scope, _ in scopes:
+    places, private = {"Diagnostic": 5}, dict[tuple[Path, str], int]()
+    for path, scope, _ in scopes:
         names = [argument.arg for argument in scope.args.args if argument.arg != "self"]
-        if "fix" in names:
+        if "fix" in names and scope.name.startswith("_"):
+            private[path, scope.name] = names.index("fix")
+        elif "fix" in names:
             places[scope.name] = names.index("fix")
     constants = {path: _assigned([*tree.body]) for path, tree in trees.items()}
     for path, _, nodes in scopes:
@@ -105,7 +108,8 @@ def _fixes() -> Iterator[tuple[str, str]]:
                 continue
             given = [item.value for item in node.keywords if item.arg == "fix"]
             name = getattr(node.func, "id", getattr(node.func, "attr", ""))
-            given += node.args[places[name] : places[name] + 1] if name in places else []
+            place = private.get((path, name), places.get(name))
+            given += [] if place is None else node.args[place : place + 1]
             for fix in given:
                 values = values or constants[path] | _assigned(nodes)
                 for text in dict.fromkeys(_texts(fix, values)):
