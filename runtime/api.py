@@ -261,7 +261,7 @@ def operating_point(
 
     Notes
     -----
-    The root finder is that of MINPACK (`scipy.optimize.root`), with the exact Jacobian.
+    The root is found by Newton's method with the exact Jacobian.
 
     Examples
     --------
