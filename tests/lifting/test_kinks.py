@@ -407,6 +407,7 @@ def test_a_critical_delay_is_that_of_the_worse_side() -> None:
     assert radius_at(found.value - 1e-9) < 1 < radius_at(found.value + 1e-9)
 
 
+@pytest.mark.whole
 def test_an_unstable_side_decides_a_long_frame_without_proofs(monkeypatch: pytest.MonkeyPatch) -> None:
     """Over 382 ticks floats leave three of four sides undecided; the fourth is unstable, also in balls."""
     system = apc.compile(str(TOPOLOGIES / "two-users-passivity.yaml"))

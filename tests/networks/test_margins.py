@@ -133,6 +133,7 @@ def test_a_box_that_is_not_served_is_refused_by_name(loss: str, box: str, why: s
     assert error.value.mistakes[0].fix == f"apc critical {box} --criterion {criterion}"
 
 
+@pytest.mark.whole
 def test_a_frame_that_grows_by_many_decades_is_unstable_and_what_lies_beyond_is_looked_past() -> None:
     """Two rooms with a fast link in each: at a large damping there a slow frame grows 1e14-fold, and more."""
     near = "  inside: {type: AveragePosition, object: cube, stiffness: 300 N/m, clock: haptic, link: near,"

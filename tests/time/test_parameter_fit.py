@@ -108,6 +108,7 @@ def independent(
     return values, np.sqrt(variance * np.diag(np.linalg.inv(jacobian.T @ jacobian)))
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     ("text", "force_column", "values", "columns"),
     [
@@ -162,6 +163,7 @@ LIBRARY = {"contact.stiffness": 1000.0, "cube.mass": 0.6, "user.device.v": 0.1, 
 LIBRARY |= {"coordination.stiffness": 500.0, "finger.stiffness": 500.0, "wall.stiffness": 800.0}
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     ("name", "suffix", "free", "signals"),
     [

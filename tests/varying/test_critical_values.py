@@ -484,6 +484,7 @@ links: {wan: {clock: network, delay: 40 ms}}
 """
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("damping", ["", "damping: 2 N*s/m,"])
 def test_a_long_delay_is_decided_as_an_analysis_decides_it(damping: str) -> None:
     system = compiled(PAIR.replace("DAMPING", damping))

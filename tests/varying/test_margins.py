@@ -143,6 +143,7 @@ def test_a_links_delay_that_no_way_has_is_no_margin() -> None:
     assert "lan.delay" in {row.parameter for row in apc.margins(compiled(one_direction)).rows}
 
 
+@pytest.mark.whole
 def test_of_very_large_systems_delays_are_said_not_to_be_looked_for() -> None:
     notes = {one.parameter: one.note for one in rows_of(apc.compile(HARD / "very-long-delay.yaml")).values()}
     assert {notes[name] for name in ("contact.delay", "coordination.delay")} == {

@@ -254,6 +254,7 @@ def test_the_equilibrium_is_found_again_at_every_value_of_a_parameter() -> None:
     assert force == pytest.approx(-((limit / 1.5) ** 3) / 20000**2, rel=1e-6)
 
 
+@pytest.mark.whole
 def test_a_region_at_the_equilibrium_has_the_boundary_of_the_local_stiffness() -> None:
     x, y = "contact.stiffness=1000 N/m^(3/2):300000 N/m^(3/2)", "device.damping=2 N*s/m:8 N*s/m"
     region = apc.region(compiled(PRESSED), x=x, y=y, operating_point="equilibrium")

@@ -55,6 +55,7 @@ def test_one_clock_has_the_largest_period_of_the_closed_form(delay_ms: int) -> N
     assert [one.stable_side for one in found.crossings] == ["below"]
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("beside", [False, True])
 @pytest.mark.parametrize(
     ("tick", "declared", "limit"),
@@ -106,6 +107,7 @@ def test_periods_of_too_long_frames_are_refused_by_name() -> None:
         apc.critical(system, "tick.period", lower="2.00011 ms", upper="2.00012 ms")
 
 
+@pytest.mark.whole
 def test_a_region_over_a_period_is_that_of_the_closed_form() -> None:
     # Stable where pull·T < 2: of pull 50 to 200 Hz and T 5 to 25 ms.
     # ∫ min(2/p, 25 ms) − 5 ms dp = 30·20 ms + ∫_80^200 (2/p − 5 ms) dp.

@@ -106,6 +106,7 @@ def test_the_commands_that_set_vary_or_play_a_delay_agree(
     assert np.interp(200, points[:, 1], points[:, 0]) == pytest.approx(LIMIT, rel=1e-3)
 
 
+@pytest.mark.whole
 @pytest.mark.needs_extension("event_order", "parameter_boxes")
 def test_a_box_and_tuned_gains_are_those_of_the_delay_that_is_set(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

@@ -113,6 +113,7 @@ def test_a_damping_beside_which_hands_get_any_force_for_nothing_stays_at_zero() 
     assert found.gains[1].value == 0 and found.proved
 
 
+@pytest.mark.whole
 def test_a_front_is_the_best_of_a_gain_for_each_bound_on_what_is_felt() -> None:
     model = compiled(AVERAGE)
     demands = read_tuning_spec(model, [f"{K}=10 N/m:7000 N/m"], maximize=K)
@@ -149,7 +150,7 @@ AIMS: dict[str, tuple[bool, Callable[[apc.Transparency, float], float]]] = {
 }
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("aim", AIMS)
 def test_what_is_felt_is_no_better_with_any_gains_of_a_grid(aim: str) -> None:
     model, free, (larger, worth) = compiled(AVERAGE), {K: (10.0, 5000.0), B: (0.0, 50.0)}, AIMS[aim]
@@ -195,6 +196,7 @@ def test_where_nothing_moves_nothing_limits_gains() -> None:
         panels_of(topology, 1)
 
 
+@pytest.mark.whole
 def test_motions_die_out_no_faster_with_any_gains_of_a_grid() -> None:
     free = {K: (10.0, 5000.0), B: (0.0, 50.0)}
     found = apc.tune(compiled(AVERAGE), free, minimize="settling_time")
@@ -244,6 +246,7 @@ def test_what_is_asked_beside_stability_is_kept_and_what_time_leaves_open_is_sai
     assert not late.proved and "; not proved" in " ".join(str(late).split())
 
 
+@pytest.mark.whole
 def test_what_the_study_asks_is_written_into_the_topology(cli: Cli) -> None:
     tune = f"  tune: {{free: {{{K}: [10 N/m, 5 N/mm]}}, maximize: {K}, over: {{lan.loss: '0:0.1'}}}}\n"
     lossy = ("delay: 8 ms}", "delay: 8 ms, loss: 5 %}  # mine")
