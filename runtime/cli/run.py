@@ -57,14 +57,12 @@ def run_command(
     from apc.realtime.peer_run import check_folder, write_run
     from apc.realtime.run_folder import read_run
     from apc.realtime.start import LocalRun, run_all, run_single
-    from apc.simulation.presence import refuse_joins_and_leaves
     from apc.simulation.trajectory import duration_of, parse_duration
     from apc.support.option_value import option_value
 
     path = find_input(file, compiled_too=True)
     folder = out or Path(f"{path.stem}.run")
     system = open_topology(str(path), settings, notify=note_aside)
-    refuse_joins_and_leaves(system, "apc run")
     requested = parse_duration(duration) if duration is not None else None
     how = LocalRun(
         duration=duration_of(system, requested),
@@ -88,7 +86,7 @@ def run_command(
         outside = None if device is None else device_function(device)
         with at_work("running"):
             parts = (run_single(system, peer, listening, addresses, how, device=outside),)
-    troubles = [mistake for part in parts if part.trouble for mistake in part.trouble.mistakes]
+    troubles = dict.fromkeys(mistake for part in parts if part.trouble for mistake in part.trouble.mistakes)
     played = [part.run for part in parts if part.run is not None]
     if played:
         write_run(folder, system, played, whole=peer is None)

@@ -51,6 +51,7 @@ DROPPED = {
     "forged": "invalid signature, or from another session",
     "duplicate": "duplicate",
     "joining": "before the sender joined",
+    "absent": "from an absent peer",
     "early": "with a future time stamp",
     "late": "with an outdated time stamp",
     "unasked": "reply without a request",

@@ -4,7 +4,7 @@ Takes: a model, the peer's name, addresses, a duration. Gives: `PeerLoop`, `live
 `number_of`; `StoppedError`.
 Guarantees: every tick is executed once, in order, even if late. A tick receives the packets that had arrived
 at its execution. A peer that starts late or again joins at the present instant. Peers that stop sending are
-held or omitted as the link specifies.
+held or omitted as the link specifies. Peers of `joins` and `leaves` are absent before and after.
 Does not: simulate other peers, or synchronize host clocks. The offset of two clocks is measured at connection
 (error: half the shortest round trip); later drift appears in the delays. A change of a host's wall-clock time
 has no effect: the clock used is monotonic.
@@ -13,6 +13,10 @@ The peer with the lowest number announces time 0 once all peers with known addre
 of them already has it. The nonce of the announcing peer is the session number. The ticks of an instant are
 executed at its end, by the simulation's program split at every instant; the peer's device is integrated as in
 the simulation.
+
+Each period between joins and leaves has its own engine. A peer also sends to the peers that join later. A
+peer that joins has start values. Each of its states in `PeerType.joining` is the mean of the newest received
+values of the peers of its group that stay. The others hold the same values until its first packet arrives.
 """
 
 from __future__ import annotations
@@ -38,6 +42,7 @@ from apc.network.packet_schedule import START, DeliveredPackets
 from apc.parameter_values.parameters import resolve
 from apc.realtime.device import DeviceFunction, ExternalDevice
 from apc.realtime.packets import DROPPED, Address, Data, Hello, HelloReply, Post
+from apc.realtime.present_peers import Period, means_at_joins, periods_of
 from apc.realtime.process_priority import now
 from apc.simulation.interpreted_engine import InterpretedEngine
 from apc.simulation.output_blocks import forces_in_time, unsolved
@@ -136,7 +141,7 @@ class PeerLoop:
         ------
         ApcError
             E970 there is no such peer, E971 one that it sends to or receives from has no address; those of
-            `prepare`.
+            `prepare` and `means_at_joins`.
         """
         self.system, self.name = system, peer
         self.exchange = build_exchange(system, resolve(system).timings)
@@ -144,6 +149,7 @@ class PeerLoop:
         self.others = {number_of(self.exchange, text, "--to"): address for text, address in addresses.items()}
         settings = Settings(duration, jit=False, seed=seed)
         self.simulation = prepare(live_topology(system), settings, signals=[f"{peer}.*"], live=True)
+        self.means = means_at_joins(system)
         self.frame_ns = int(self.simulation.frame * self.simulation.quantum * NANO)
         self.frames = -(-int(duration * NANO) // self.frame_ns)
         self.post = Post(
@@ -157,18 +163,31 @@ class PeerLoop:
         self.offsets: dict[int, tuple[int, int]] = {}
         self.began: HelloReply | None = None  # the first reply with the start of the model
         self.last_hello = 0  # the time of the last hello
-        self.first = 0  # the frame in which this peer joins
         self.stopped = False
         self.trouble: ApcError | None = None  # the error that ended the loop
         self.stop = stop
         self.watched: list[socket.socket | Connection] = [listening, *([stop] if stop else [])]
         self.rows: list[Floats] = []
-        self.player = _SinglePeer(self, device, emulate=emulate)
+        self.routes = self.simulation.population.exchange_program.routes
+        # For each route, the indices of the incoming directed links of this peer.
+        self.mine = [np.flatnonzero(route.pairs[:, 1] == self.local) for route in self.routes]
+        self.players: list[_SinglePeer] = []  # one for each period
+        self.stage = 0  # the index of the present one
+        for period in periods_of(self.simulation, self.local, self.frames):
+            self.players.append(_SinglePeer(self, period, device, emulate=emulate))
+        for index, player in enumerate(self.players):
+            player.send_to_joining(self.players[index + 1 :])
+        self.first = self.player.period.first  # the frame in which this peer joins
         self._check_addresses()
+
+    @property
+    def player(self) -> _SinglePeer:
+        """The engine of the present period."""
+        return self.players[self.stage]
 
     def _check_addresses(self) -> None:
         """Raise ApcError E971 for missing, superfluous or equal addresses."""
-        pairs = {tuple(pair) for route in self.player.routes for pair in route.pairs.tolist()}
+        pairs = {tuple(pair) for route in self.routes for pair in route.pairs.tolist()}
         needed = {item for pair in pairs if self.local in pair for item in pair} - {self.local}
         unknown = [self.exchange.peer_name(other) for other in sorted(needed - set(self.others))][:4]
         wrong = (
@@ -215,7 +234,8 @@ class PeerLoop:
             A stop was requested before.
         """
         end, leads = now() + int(patience * NANO), self.local < min(self.others)
-        self.player.warm_up()
+        for player in self.players:
+            player.warm_up()
         while not self.session:
             self._send_hellos(self.others)
             self.take_in(now() + HELLO_PERIOD)
@@ -230,7 +250,9 @@ class PeerLoop:
             elif now() > end:
                 raise self._no_answer(patience)
         if now() > self.begins:  # a late or restarted peer joins in the frame after the next
-            self.first = (now() - self.begins) // self.frame_ns + 2
+            self.first = max(self.first, (now() - self.begins) // self.frame_ns + 2)
+            while self.player.period.until <= self.first and self.player is not self.players[-1]:
+                self.stage += 1
             self.player.instant = self.first * self.frame_ns
 
     def _send_hellos(self, others: Iterable[int]) -> None:
@@ -252,18 +274,23 @@ class PeerLoop:
     # ---- running
 
     def run(self) -> None:
-        """Run until the end, a stop request, or a failure of the device or an equation."""
-        simulation, first = self.simulation, self.first
-        while first < self.frames:
-            count = min(simulation.length, self.frames - first)
-            forces = forces_in_time(simulation, first)
-            result = self.player.advance(first, count, forces)
-            self.rows.append(result.rows[: result.frames * len(simulation.sample_times)].copy())
-            first += result.frames
-            if result.frames < count:
-                if not (self.stopped or self.trouble):
-                    self.trouble = unsolved(simulation, first)
-                return
+        """Run until the end, the leave, a stop request, or a failure of the device or an equation."""
+        first = self.first
+        for player in self.players[self.stage :]:
+            simulation, period = player.period.simulation, player.period
+            if period.first > self.first:
+                player.continue_from(self.player)
+                self.stage += 1
+            while first < period.until:
+                count = min(simulation.length, period.until - first)
+                forces = forces_in_time(replace(simulation, length=count), first)
+                result = player.advance(first, count, forces)
+                self.rows.append(result.rows[: result.frames * len(simulation.sample_times)].copy())
+                first += result.frames
+                if result.frames < count:
+                    if not (self.stopped or self.trouble):
+                        self.trouble = unsolved(simulation, first)
+                    return
 
     def wait(self, instant: int) -> int:
         """Receive packets until an instant of the model, in nanoseconds.
@@ -308,12 +335,17 @@ class PeerLoop:
             came = now()
             match self.post.read(datagram, address[:2]):
                 case Data() as packet:
-                    self.player.receive(packet, came - self.begins)
+                    self._receiver(packet).receive(packet, came - self.begins)
                 case Hello() as hello:
                     answer = self.post.answer(now(), hello, came, self.begins, self.session)
                     self._send(answer, address)
                 case HelloReply() as answer:
                     self._synchronize(answer, came)
+
+    def _receiver(self, packet: Data) -> _SinglePeer:
+        """Return the engine of the first period, from the present one on, in which a packet is received."""
+        receivers = (player for player in self.players[self.stage :] if packet.sender in player.column_of)
+        return next(receivers, self.player)
 
     def _synchronize(self, answer: HelloReply, came: int) -> None:
         """Determine another peer's clock offset, and the start of the model, from a reply (RFC 5905,
@@ -334,24 +366,27 @@ class PeerLoop:
 
 
 class _SinglePeer(InterpretedEngine):
-    """One peer of a population, executed instant by instant; the other peers' packets come from the network.
+    """One peer in a period, executed instant by instant; the other peers' packets come from the network.
 
     `log` has (due, late, took) of each instant, `arrivals` (link, sender, count, sent, arrived) of each
     packet, all in nanoseconds of the session; `observed`, per route, has the packets in effect at its ticks
     on the peer's incoming links.
     """
 
-    def __init__(self, loop: PeerLoop, device: DeviceFunction | None, *, emulate: bool) -> None:
-        simulation, population = loop.simulation, loop.simulation.population
-        self.loop, self.routes = loop, population.exchange_program.routes
-        self.member = next(g for g, member in enumerate(population.members) if loop.local in member.peers)
+    def __init__(
+        self, loop: PeerLoop, period: Period, device: DeviceFunction | None, *, emulate: bool
+    ) -> None:
+        simulation, population = period.simulation, period.simulation.population
+        self.loop, self.period, self.routes = loop, period, population.exchange_program.routes
+        self.member = next(g for g, member in enumerate(population.members) if period.local in member.peers)
+        columns = population.exchange_program.column_of[: len(period.peers)].tolist()
+        self.column_of = dict(zip(period.peers.tolist(), columns, strict=True))  # by the number of a peer
         super().__init__(population, None, moving=(self.member,))
         self.quantum_ns = simulation.quantum * NANO
         schedules = [member.program.schedule for member in population.members]
         self.begin_at = [0, *(int(number * self.quantum_ns) for number in instants_within(schedules))]
-        self.links = [_LinkState(loop, index) for index in range(len(loop.system.links))]
+        self.links = [_LinkState(loop, period, index) for index in range(len(loop.system.links))]
         self.newest = [np.full(len(route.pairs), START, np.int64) for route in self.routes]
-        self.mine = [np.flatnonzero(route.pairs[:, 1] == loop.local) for route in self.routes]
         self.observed: list[list[tuple[Integers, Flags]]] = [[] for _ in self.routes]
         self.network = _EmulatedNetwork(loop) if emulate else None
         member = population.members[self.member]
@@ -363,13 +398,67 @@ class _SinglePeer(InterpretedEngine):
         self.log: list[tuple[int, int, int]] = []
         self.arrivals: list[tuple[int, int, int, int, int]] = []
         self.sent: dict[int, Counter[int]] = defaultdict(Counter)  # packets by link and receiver
-        self.instant = 0
+        self.instant = period.first * loop.frame_ns
+        if loop.players:  # the record of all periods is one
+            before = loop.players[0]
+            self.observed, self.network, self.held_back = before.observed, before.network, before.held_back
+            self.log, self.arrivals, self.sent = before.log, before.arrivals, before.sent
+            self.ahead = before.ahead
+            for link, other in zip(self.links, before.links, strict=True):
+                link.counts = other.counts
 
     def warm_up(self) -> None:
         """Execute a frame whose packets have no receiver, so that loading and compiling precede the run."""
-        self.advance(0, 1, forces_in_time(self.loop.simulation, 0))
+        self.advance(0, 1, forces_in_time(replace(self.period.simulation, length=1), 0))
         self.begin(0)
-        self.log, self.observed = [], [[] for _ in self.routes]
+        for record in (self.log, *self.observed):
+            record.clear()
+        self.instant = self.period.first * self.loop.frame_ns
+
+    # ---- joins and leaves
+
+    def send_to_joining(self, later: Sequence[_SinglePeer]) -> None:
+        """Send to the peers that join in a later period, too."""
+        for player in later:
+            for link, later_link in zip(self.links, player.links, strict=True):
+                link.receivers |= later_link.receivers
+
+    def _join(self) -> None:
+        """Set the means at the joining peers, in the local states and in the held values."""
+        self._take_arrived()
+        period, groups, program = self.period, self.period.groups, self.population.exchange_program
+        own = self.carries[self.member]
+        for index, (route, held) in enumerate(zip(self.routes, self.held, strict=True)):
+            self._deliver(index, self.newest[index].copy(), np.zeros(len(route.pairs), np.bool_))
+            mine = np.flatnonzero(route.pairs[:, 1] == period.local)
+            senders = route.pairs[mine, 0]
+            known = (self.newest[index][mine] != START) & ~np.isin(senders, period.joined)
+            for row, keys in enumerate(program.channels[index]):
+                sent = program.keys[keys[0]]
+                for peer in period.joined:
+                    state = self.loop.means[groups[peer]].get((sent.link, sent.channel))
+                    values = held[row, mine[known & (groups[senders] == groups[peer])]]
+                    if state is None or not len(values):
+                        continue
+                    if peer == period.local:
+                        own[state] = values.mean()
+                    elif groups[peer] == groups[period.local]:
+                        values = np.append(values, own[state])
+                    held[row, mine[senders == peer]] = values.mean()
+
+    def continue_from(self, before: _SinglePeer) -> None:
+        """Take over the values of the peers that stay, and the packets on the links between them."""
+        for number in self.column_of.keys() & before.column_of.keys():
+            self.packets[:, :, self.column_of[number]] = before.packets[:, :, before.column_of[number]]
+        self.carries[self.member][:] = before.carries[before.member]
+        if self.outside and before.outside:
+            self.outside.before = before.outside.before
+        for route, links in enumerate(self.period.links):
+            _, old, new = np.intersect1d(before.period.links[route], links, return_indices=True)
+            for name in ("held", "effective", "newest"):
+                getattr(self, name)[route][..., new] = getattr(before, name)[route][..., old]
+
+    # ---- ticks
 
     def _segment(
         self,
@@ -383,6 +472,8 @@ class _SinglePeer(InterpretedEngine):
         instant = number * self.loop.frame_ns + self.begin_at[index]
         late, begin = self.loop.wait(instant), now()
         self.instant = instant
+        if index == 0 and number == self.period.first and len(self.period.joined):
+            self._join()
         outside = self.outside if self.loop.begins else None
         if outside and (index == 0 or self.begin_at[index] > self.begin_at[index - 1]):
             self._call_device(outside.measure, instant / NANO, self.carries[self.member])
@@ -417,19 +508,25 @@ class _SinglePeer(InterpretedEngine):
 
         A late peer does not receive packets sampled after its present instant.
         """
-        while self.ahead and self.ahead[0][0] <= self.instant:
-            _, _, packet = heapq.heappop(self.ahead)
-            link = self.links[packet.link]
-            for route_index, arc in link.arcs[packet.sender]:
-                last = self.newest[route_index][arc]
-                self.newest[route_index][arc] = max(last, packet.count) if link.newest else packet.count
-        newest, arrival_process = self.newest[index], self.loop.simulation.arrival_processes[index]
+        self._take_arrived()
+        newest, arrival_process = self.newest[index], self.period.simulation.arrival_processes[index]
         instant = int(self.instant // self.quantum_ns)
         due = (instant - arrival_process.nominal - arrival_process.phase) // arrival_process.period
         missing = (newest < due) & (due >= 0) & arrival_process.zero
-        own_arcs = self.mine[index]
-        self.observed[index].append((newest[own_arcs].copy(), missing[own_arcs].copy()))
+        mine, pairs = self.loop.mine[index], self.loop.routes[index].pairs  # of all peers
+        recorded, lost = np.full(len(pairs), START, np.int64), np.zeros(len(pairs), np.bool_)
+        recorded[self.period.links[index]], lost[self.period.links[index]] = newest, missing
+        self.observed[index].append((recorded[mine], lost[mine]))
         return newest.copy(), missing
+
+    def _take_arrived(self) -> None:
+        """Take the packets sampled until the present instant into effect."""
+        while self.ahead and self.ahead[0][0] <= self.instant:
+            _, _, packet = heapq.heappop(self.ahead)
+            link = self.links[packet.link]
+            for route_index, arc in link.arcs.get(packet.sender, ()):
+                last = self.newest[route_index][arc]
+                self.newest[route_index][arc] = max(last, packet.count) if link.newest else packet.count
 
     def _send_packets(self, number: int, index: int) -> None:
         """Send the packets of a segment, each at its instant or, if emulated, at its arrival time."""
@@ -440,7 +537,7 @@ class _SinglePeer(InterpretedEngine):
             link = next(link for link in self.links if link.name == name)
             count = number * link.slots + slot
             keys = [link.keys[channel, slot] for channel in link.channels_of(loop.local)]
-            column = self.population.exchange_program.column_of[loop.local]
+            column = self.column_of[loop.local]
             values = tuple(
                 self.packets[number % self.population.exchange_program.ring, keys, column].tolist()
             )
@@ -466,15 +563,15 @@ class _SinglePeer(InterpretedEngine):
         exchange_program, (frame, slot) = self.population.exchange_program, divmod(packet.count, link.slots)
         link.counts.setdefault(packet.sender, set()).add(packet.count)
         keys = [link.keys[channel, slot] for channel in link.channels_of(packet.sender)]
-        self.packets[frame % exchange_program.ring, keys, exchange_program.column_of[packet.sender]] = (
-            packet.values
-        )
+        self.packets[frame % exchange_program.ring, keys, self.column_of[packet.sender]] = packet.values
         heapq.heappush(self.ahead, (link.instant(packet.count), len(self.arrivals), packet))
         self.arrivals.append((link.location, packet.sender, packet.count, link.instant(packet.count), came))
 
     def _drop_reason(self, packet: Data, came: int, link: _LinkState) -> str:
         """Return the reason for dropping a packet, "" if it is valid."""
-        if packet.sender not in link.arcs or len(packet.values) != len(link.channels_of(packet.sender)):
+        if packet.sender not in link.arcs:
+            return "absent" if self.loop.simulation.presence else "malformed"
+        if len(packet.values) != len(link.channels_of(packet.sender)):
             return "malformed"
         if not self.loop.begins:
             return "joining"
@@ -490,7 +587,7 @@ class _SinglePeer(InterpretedEngine):
 
 
 class _LinkState:
-    """The data of a link at one peer.
+    """The data of a link at one peer, in a period; peers are numbered among all peers.
 
     `location` is the index of the link, `name` its name, `slots` the number of packets per frame; `receivers`
     are the peers that receive from this peer. `channels` are the channels that each peer sends over the link,
@@ -498,8 +595,8 @@ class _LinkState:
     of each sender, `counts` the numbers of the packets received from each sender.
     """
 
-    def __init__(self, loop: PeerLoop, index: int) -> None:
-        population = loop.simulation.population
+    def __init__(self, loop: PeerLoop, period: Period, index: int) -> None:
+        population, peers = period.simulation.population, period.peers
         self.location, self.name = index, loop.system.links[index].name
         link, timings = loop.system.links[index], resolve(loop.system).timings
         clock = next(clock for clock in loop.system.clocks if clock.name == link.clock)
@@ -509,13 +606,14 @@ class _LinkState:
         self.channels: dict[int, list[str]] = {}
         for member in population.members:
             sent = sorted({sent.channel for sent in member.program.schedule.sent if sent.link == self.name})
-            self.channels |= dict.fromkeys(member.peers.tolist(), sent)
+            self.channels |= dict.fromkeys(peers[member.peers].tolist(), sent)
         rows = enumerate(population.exchange_program.keys)
         self.keys = {(sent.channel, sent.slot): row for row, sent in rows if sent.link == self.name}
         self.receivers: set[int] = set()
         self.arcs: dict[int, list[tuple[int, int]]] = {}
         for route_index, route in enumerate(population.exchange_program.routes):
-            for arc, (sender, receiver) in enumerate(route.pairs.tolist() if route.link == self.name else ()):
+            pairs = peers[route.pairs].tolist() if route.link == self.name else ()
+            for arc, (sender, receiver) in enumerate(pairs):
                 if sender == loop.local:
                     self.receivers.add(receiver)
                 if receiver == loop.local:

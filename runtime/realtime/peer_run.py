@@ -116,7 +116,7 @@ def run_of(loop: PeerLoop, digest: bytes, not_given: tuple[str, ...]) -> PeerRun
 
     def at_ticks(index: int, kind: type) -> tuple[NDArray[Any], ...]:
         """Return one entry of the records at ticks for each route, (ticks, links)."""
-        arcs = zip(player.observed, player.mine, strict=True)
+        arcs = zip(player.observed, loop.mine, strict=True)
         return tuple(
             np.array([tick[index] for tick in ticks], kind).reshape(len(ticks), len(mine))
             for ticks, mine in arcs

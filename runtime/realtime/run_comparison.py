@@ -27,7 +27,6 @@ from apc.network.packet_schedule import START, DeliveredPackets
 from apc.realtime.peer import live_topology, traced
 from apc.realtime.peer_run import PeerRun, RealtimeRun, delays_of, trace_name
 from apc.result import Result
-from apc.simulation.interpreted_engine import InterpretedEngine
 from apc.simulation.output_blocks import blocks
 from apc.simulation.population import Population
 from apc.simulation.settings import Settings
@@ -132,9 +131,9 @@ def compare_run(run: RealtimeRun) -> RunComparison:
         Those of `prepare`, for a model that cannot be simulated.
     """
     system, peers = run.system, run.peers
-    simulation = prepare(live_topology(system), Settings(_duration(peers), jit=False))
+    simulation = _prepared(run)
     frame = float(simulation.frame * simulation.quantum)
-    why_not, arcs = reason_not_simulated(system, peers), _arc_runs(run)
+    why_not, arcs = reason_not_simulated(system, peers, simulation), _arc_runs(run)
     received = [
         [arc for arc in arcs if arc.link == link.name and arc.came.distribution] for link in system.links
     ]
@@ -155,21 +154,40 @@ def compare_run(run: RealtimeRun) -> RunComparison:
     )
 
 
-def _duration(peers: tuple[PeerRun, ...]) -> Fraction:
-    """Return the duration in seconds that all peers recorded."""
-    ends = [float(peer.time[-1]) for peer in peers if len(peer.time)]
+def _prepared(run: RealtimeRun) -> Simulation:
+    """Return the simulation of a run, with the joins and leaves that were recorded."""
+    system, duration = run.system, _duration(run.system, run.peers)
+    joins, leaves = (
+        tuple(item for item in items if item.at < duration)
+        for items in (system.experiment.joins, system.experiment.leaves)
+    )
+    recorded = replace(system, experiment=replace(system.experiment, joins=joins, leaves=leaves))
+    return prepare(live_topology(recorded), Settings(duration, jit=False))
+
+
+def _duration(system: Model, peers: tuple[PeerRun, ...]) -> Fraction:
+    """Return the duration in seconds that all peers recorded, except those that leave."""
+    leaving = {item.peer.strip() for item in system.experiment.leaves}
+    ends = [float(peer.time[-1]) for peer in peers if len(peer.time) and peer.name not in leaving]
     return Fraction(max(min(ends, default=0.0), 1e-3)).limit_denominator(10**6)
 
 
-def reason_not_simulated(system: Model, peers: tuple[PeerRun, ...]) -> str:
-    """Return the reason why the run cannot be simulated, "" if it can."""
+def reason_not_simulated(
+    system: Model, peers: tuple[PeerRun, ...], simulation: Simulation | None = None
+) -> str:
+    """Return the reason why the run cannot be simulated, "" if it can.
+
+    `simulation` is that of the run, None if all peers are always present.
+    """
+    presence = simulation.presence if simulation else None
+    joins = presence.joins // simulation.frame if simulation and presence else np.zeros(system.peers)
     if len(peers) < system.peers:
         return f"only {len(peers)} of {system.peers} peers recorded the run"
     if local := [peer.name for peer in peers if peer.outside]:
         return f"{', '.join(local)} had an external device with unknown motion"
     if none := [peer.name for peer in peers if not all(map(len, peer.packets))]:
         return f"{', '.join(none)} ended before the first tick with received samples"
-    late = [peer.name for peer in peers if peer.first]
+    late = [peer.name for peer in peers if peer.first != joins[peer.number]]
     return f"{', '.join(late)} joined later or again, in a different state" if late else ""
 
 
@@ -177,43 +195,46 @@ class DeliveredRun:
     """The packets in effect at the ticks of a run, frame by frame (see `packet_schedule`)."""
 
     def __init__(self, run: RealtimeRun, population: Population) -> None:
-        self.now, self.observed = 0, list[DeliveredPackets]()
-        self.frame = population.frame
+        self.now, self.run, self.frame = 0, run, population.frame
         self.routes = population.exchange_program.routes
-        for index, route in enumerate(self.routes):
-            rows = min(len(peer.packets[index]) for peer in run.peers if peer.packets[index].size)
-            packets = np.full((rows, len(route.pairs)), START, np.int64)
-            missing = np.zeros(packets.shape, np.bool_)
-            for peer in run.peers:
-                arcs = np.flatnonzero(route.pairs[:, 1] == peer.number)
-                if len(arcs):
-                    packets[:, arcs] = peer.packets[index][:rows]
-                    missing[:, arcs] = peer.missing[index][:rows]
-            self.observed.append(DeliveredPackets(packets, missing))
 
     def take(self, until: int) -> tuple[DeliveredPackets, ...]:
-        """Return the packets in effect at each route's ticks until the end of a frame, in quanta."""
+        """Return the packets in effect at each route's ticks until the end of a frame, in quanta.
+
+        The first and the last recorded ones of a peer are continued.
+        """
         first, last, self.now = self.now // self.frame, until // self.frame, until
         delivered = []
-        for route, recorded in zip(self.routes, self.observed, strict=True):
-            rows = np.minimum(np.arange(first * route.ticks, last * route.ticks), len(recorded.packets) - 1)
-            delivered.append(DeliveredPackets(recorded.packets[rows], recorded.missing[rows]))
+        for index, route in enumerate(self.routes):
+            ticks = np.arange(first * route.ticks, last * route.ticks)
+            packets = np.full((len(ticks), len(route.pairs)), START, np.int64)
+            missing = np.zeros(packets.shape, np.bool_)
+            for peer in self.run.peers:
+                if len(arcs := np.flatnonzero(route.pairs[:, 1] == peer.number)):
+                    rows = np.clip(ticks - peer.first * route.ticks, 0, len(peer.packets[index]) - 1)
+                    packets[:, arcs], missing[:, arcs] = peer.packets[index][rows], peer.missing[index][rows]
+            delivered.append(DeliveredPackets(packets, missing))
         return tuple(delivered)
 
 
 def _differences(run: RealtimeRun, simulation: Simulation) -> dict[str, tuple[float, float]]:
     """Return the largest differences between recorded and simulated signals, by unit."""
-    player = InterpretedEngine(simulation.population, lambda _: DeliveredRun(run, simulation.population))
-    simulated_rows = np.concatenate([block.values for block in blocks(simulation, player=player)])
+    player = simulation.player(lambda _: DeliveredRun(run, simulation.population))
+    output = list(blocks(simulation, player=player))
+    time, simulated_rows = (
+        np.concatenate([getattr(block, name) for block in output]) for name in ("time", "values")
+    )
     simulated = {
         signal.name: (signal.unit, simulated_rows[:, column])
         for column, signal in enumerate(simulation.signals)
     }
     result: dict[str, tuple[float, float]] = {}
     for peer in run.peers:
-        for name, recorded in zip(peer.signals, peer.values[: len(simulated_rows)].T, strict=True):
+        first = int(np.argmin(np.abs(time - peer.time[0])))
+        rows = slice(first, first + len(peer.time))
+        for name, recorded in zip(peer.signals, peer.values[: len(time) - first].T, strict=True):
             unit, values = simulated[name]
-            difference = float(np.abs(recorded - values[: len(recorded)]).max(initial=0.0))
+            difference = float(np.abs(recorded - values[rows]).max(initial=0.0))
             largest_difference, largest_value = result.get(unit, (0.0, 0.0))
             result[unit] = (
                 max(largest_difference, difference),

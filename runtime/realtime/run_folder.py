@@ -27,6 +27,7 @@ from apc.network.packet_schedule import START, Route
 from apc.realtime.packets import DROPPED
 from apc.realtime.peer import live_topology
 from apc.realtime.peer_run import ARRAYS, OF_ROUTES, TOPOLOGY, PeerRecord, PeerRun, RealtimeRun
+from apc.simulation.presence import always_present
 from apc.simulation.settings import Settings
 from apc.simulation.simulation import Simulation, prepare
 from apc.support.npz import DamageError, read_arrays
@@ -68,7 +69,7 @@ def read_run(folder: Path) -> RealtimeRun:
     many = f"has {counted(len(files), 'peer', ',')} of a topology with {system.peers:,}"
     refuse(len(files) > system.peers, many)
     names = tuple(f"{group.name}[{index + 1}]" for group in system.groups for index in range(group.count))
-    simulation = prepare(live_topology(system), Settings(Fraction(1, 1000), jit=False))
+    simulation = prepare(live_topology(always_present(system)), Settings(Fraction(1, 1000), jit=False))
     topology = _Topology(names, tuple(link.name for link in system.links), simulation)
     peers = tuple(
         sorted((_read_peer(path, topology) for path in files), key=lambda peer_run: peer_run.number)

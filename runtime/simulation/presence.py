@@ -1,7 +1,7 @@
 """The peers that are present at each instant of a simulation.
 
 Takes: the first and the last instant of each peer; a model.
-Gives: `Presence`, `first_peers`; `refuse_joins_and_leaves`, `location_of`.
+Gives: `Presence`, `first_peers`, `always_present`, `stored_names`; `refuse_joins_and_leaves`, `location_of`.
 Guarantees: a peer is present from its join until just before its leave.
 Does not: read or check the instants (see the extension `changing_counts`).
 """
@@ -9,12 +9,12 @@ Does not: read or check the instants (see the extension `changing_counts`).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.compiler.compiled import Model, PeerTime
+from apc.compiler.compiled import Model, PeerTime, PeerType
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.simulation.signals import Signal
 
@@ -52,6 +52,20 @@ def first_peers(system: Model) -> dict[str, int]:
     """Return the index of the first peer of each group."""
     starts = np.cumsum([0, *(group.count for group in system.groups)]).tolist()
     return {group.name: start for group, start in zip(system.groups, starts, strict=False)}
+
+
+def always_present(system: Model) -> Model:
+    """Return a model without joins and leaves: all its peers are always present."""
+    return replace(system, experiment=replace(system.experiment, joins=(), leaves=()))
+
+
+def stored_names(peer_type: PeerType) -> list[str]:
+    """Return the names of the states, the held outputs and the stored values of a peer."""
+    names = [state.name for state in peer_type.states]
+    for partition in peer_type.clocks:
+        held = (hold.output for hold in peer_type.holds if hold.clock == partition.clock)
+        names += [partition.outputs[output] for output in (*partition.memories, *held)]
+    return names
 
 
 def location_of(system: Model, key: str, item: PeerTime) -> SourceLocation:

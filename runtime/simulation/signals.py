@@ -72,20 +72,18 @@ def local_signals(peer_type: PeerType, schedule: Schedule) -> tuple[LocalSignal,
     return tuple(signals)
 
 
-def sent_states(peer_type: PeerType) -> tuple[int, ...]:
-    """Return the indices of the states that a subsystem sends to others unchanged."""
-    indices = []
+def sent_states(peer_type: PeerType) -> dict[int, list[tuple[str, str]]]:
+    """Return the links and channels of the states that a subsystem sends to others unchanged, by index."""
+    sent: dict[int, list[tuple[str, str]]] = {}
     for send in peer_type.sends:
         if send.send.is_a("SXFunction"):
             inputs = send.send.sx_in()
             channels = send.send(*inputs)
-            indices += [
-                index
-                for row in range(channels.numel())
-                for index in range(len(peer_type.states))
-                if casadi.is_equal(channels[row], inputs[0][index])
-            ]
-    return tuple(dict.fromkeys(indices))
+            for row, channel in enumerate(send.channels):
+                for index in range(len(peer_type.states)):
+                    if casadi.is_equal(channels[row], inputs[0][index]):
+                        sent.setdefault(index, []).append((send.link, channel))
+    return sent
 
 
 def ticking_partitions(schedule: Schedule) -> list[int]:

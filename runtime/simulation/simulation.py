@@ -136,7 +136,7 @@ class Simulation:
         `deliveries` gives the packets of a run over unreliable links; by default a `Timetable`.
         """
         if self.presence is not None:
-            engine: FrameEngine = require_extension("changing_counts").changing_engine(self)
+            engine: FrameEngine = require_extension("changing_counts").changing_engine(self, deliveries)
             return engine
         routes = self.population.exchange_program.routes
         timetable = partial(Timetable, routes, self.arrival_processes, seed=self.seed)

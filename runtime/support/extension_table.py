@@ -51,8 +51,10 @@ EXTENSIONS = {
             "--changing; apc.changing_counts; joins and leaves of a simulation",
             (
                 "changing_engine:changing_engine",
+                "changing_engine:pair_indices",
                 "joins_and_leaves:changing_counts",
                 "peer_times:model_at_end",
+                "peer_times:model_of_present",
                 "peer_times:presence_of",
                 "peer_times:with_peer_times",
             ),

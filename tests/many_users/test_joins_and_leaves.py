@@ -246,9 +246,6 @@ def test_the_experiment_of_a_topology_has_joins_and_leaves(cli: Cli, tmp_path: P
     )
     run = apc.simulate(path)
     assert np.isfinite(run["user[3].cube.x"]).sum() == 121 and np.isfinite(run["user[1].cube.x"]).sum() == 160
-    refused = cli("run", str(path), "--out", str(tmp_path / "x.run"))
-    assert refused.code == 1 and "E914 joins are not available in apc run" in " ".join(refused.err.split())
-    assert not (tmp_path / "x.run").exists()
 
 
 NAMED = """parameters: {late: 80 ms, early: 160 ms}

@@ -1,7 +1,7 @@
 """An engine for peers that join and leave: one simulation for each set of present peers.
 
 Takes: a `Simulation` with its `Presence`.
-Gives: `changing_engine`, `ChangingEngine`; `PresentPeers`, `PresentDeliveries`.
+Gives: `changing_engine`, `ChangingEngine`; `PresentPeers`, `PresentDeliveries`; `pair_indices`.
 Guarantees: between changes the motion is exactly that of a model of the present peers alone. The rows of
 absent peers are NaN.
 Does not: read the instants (see `peer_times`).
@@ -21,7 +21,7 @@ At the start of the frame of a change, in this order:
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -87,16 +87,24 @@ class PresentDeliveries:
         return tuple(result)
 
 
-def changing_engine(simulation: Simulation) -> ChangingEngine:
-    """Return an engine of a simulation in which peers join and leave."""
-    return ChangingEngine(simulation)
+def changing_engine(
+    simulation: Simulation, deliveries: Callable[[int], DeliverySource] | None = None
+) -> ChangingEngine:
+    """Return an engine of a simulation in which peers join and leave.
+
+    `deliveries` gives the packets of a run of all peers, as recorded by `apc run`; by default a `Timetable`.
+    """
+    return ChangingEngine(simulation, deliveries)
 
 
 class ChangingEngine:
     """An engine that passes from one set of present peers to the next."""
 
-    def __init__(self, simulation: Simulation) -> None:
+    def __init__(
+        self, simulation: Simulation, deliveries: Callable[[int], DeliverySource] | None = None
+    ) -> None:
         assert simulation.presence is not None
+        self.deliveries = deliveries
         self.simulation, self.presence = simulation, simulation.presence
         last = int(simulation.settings.duration / simulation.quantum)
         self.changes = (self.presence.changes(last) // simulation.frame).tolist()
@@ -107,8 +115,9 @@ class ChangingEngine:
             for signal, column in zip(simulation.signals, simulation.order.tolist(), strict=True)
         }
         self.routes = simulation.population.exchange_program.routes
+        # A peer of `apc run` receives packets before its join.
         self.first = tuple(
-            self.presence.joins[route.pairs].max(axis=1) // simulation.frame * route.slots
+            self.presence.joins[route.pairs].max(axis=1) // simulation.frame * route.slots * (not deliveries)
             for route in self.routes
         )
         self.begin(0)
@@ -119,7 +128,11 @@ class ChangingEngine:
         """Reset all peers to time 0 of a run (see `population.FrameEngine`)."""
         self.work_of_absent = np.zeros(len(self.simulation.population.parts))
         seed = self.simulation.seed
-        self.source = Timetable(self.routes, self.simulation.arrival_processes, seed=seed, run=run)
+        self.source: DeliverySource = (
+            self.deliveries(run)
+            if self.deliveries
+            else Timetable(self.routes, self.simulation.arrival_processes, seed=seed, run=run)
+        )
         self.now = self._prepare(self._present_in(0))
 
     def advance(self, first: int, count: int, pushes: Sequence[Floats | None]) -> FrameRows:
@@ -166,7 +179,7 @@ class ChangingEngine:
         ]
         sources, targets = np.array(pairs, np.int64).reshape(-1, 2).T
         routes = zip(simulation.population.exchange_program.routes, self.routes, strict=True)
-        links = tuple(_indices(peers[route.pairs], all_links.pairs) for route, all_links in routes)
+        links = tuple(pair_indices(peers[route.pairs], all_links.pairs) for route, all_links in routes)
         deliveries = partial(self._deliveries, links) if links else None
         engine = simulation.player(deliveries)
         assert isinstance(engine, (CompiledEngine, InterpretedEngine))
@@ -257,7 +270,7 @@ def _received(
     return held, effective
 
 
-def _indices(pairs: Integers, all_pairs: Integers) -> Integers:
+def pair_indices(pairs: Integers, all_pairs: Integers) -> Integers:
     """Return the index of each (sender, receiver) pair in a list of pairs that contains it."""
     index_of = {pair: index for index, pair in enumerate(map(tuple, all_pairs.tolist()))}
     return np.array([index_of[sender, receiver] for sender, receiver in pairs.tolist()], np.int64)

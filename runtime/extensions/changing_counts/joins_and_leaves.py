@@ -43,6 +43,7 @@ from apc.lifting.numeric_model import NumericModel
 from apc.parameter_values.overrides import Override, apply
 from apc.parameter_values.parameter_names import ParameterRef, find
 from apc.result import Result
+from apc.simulation.presence import stored_names
 from apc.spectrum.eigenpairs import largest_magnitudes
 from apc.spectrum.enclosure import enclose_eigenvalues
 from apc.spectrum.kyp_bounds import is_positive
@@ -181,23 +182,13 @@ def changing_counts(numeric: NumericModel, text: str, *, lossy: bool = False) ->
 
 def _parts_at_start(system: Model) -> tuple[str, ...]:
     """Return the parts with states or stored values that are not means at a joining peer."""
-    names = [
-        (peer_type, name)
-        for peer_type in system.peer_types
-        for name in (
-            *(state.name for state in peer_type.states),
-            *(
-                partition.outputs[output]
-                for partition in peer_type.clocks
-                for output in (
-                    *partition.memories,
-                    *(hold.output for hold in peer_type.holds if hold.clock == partition.clock),
-                )
-            ),
-        )
-    ]
     return tuple(
-        dict.fromkeys(name.partition(".")[0] for type_, name in names if not type_.joins_at_mean(name))
+        dict.fromkeys(
+            name.partition(".")[0]
+            for peer_type in system.peer_types
+            for name in stored_names(peer_type)
+            if not peer_type.joins_at_mean(name)
+        )
     )
 
 

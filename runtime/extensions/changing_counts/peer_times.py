@@ -24,7 +24,7 @@ from apc.compiler.peer_counts import least_peers
 from apc.compiler.source.reading import fault
 from apc.parameter_values.overrides import Override, apply
 from apc.parameter_values.parameter_names import OVERRIDE, find
-from apc.simulation.presence import Presence, first_peers, location_of
+from apc.simulation.presence import Presence, always_present, first_peers, location_of
 from apc.simulation.simulation import Simulation
 from apc.timing.schedule import Schedule
 
@@ -214,12 +214,11 @@ def model_of_present(system: Model, present: Flags) -> Model:
     own = {count_of(link.name) for link in system.links}
     starts = first_peers(system)
     plain = replace(
-        system,
+        always_present(system),
         groups=tuple(
             replace(group, columns=tuple(column for column in group.columns if column.name in own))
             for group in system.groups
         ),
-        experiment=replace(system.experiment, joins=(), leaves=()),
     )
     changed = apply(
         plain,
