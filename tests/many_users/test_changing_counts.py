@@ -18,6 +18,7 @@ from tests.topologies import TOPOLOGIES
 pytestmark = pytest.mark.needs_extension("changing_counts")
 
 Floats = NDArray[np.float64]
+SIZE = 14  # values of a peer
 AVERAGE, MESH = TOPOLOGIES / "three-users-average.yaml", TOPOLOGIES / "three-users-mesh.yaml"
 
 
@@ -88,6 +89,54 @@ def test_products_up_to_eight_frames_agree_with_the_verdict(operator: str) -> No
         assert 1 < found.growth <= growth * (1 + 1e-9)
     else:
         assert growth < 1
+
+
+def change(before: int, after: int, first: int) -> Floats:
+    """Return the map of all peers' values at a change of their number.
+
+    The peers from index `first` on leave. Those that join have the mean of the others.
+    """
+    if after < before:
+        staying = [peer for peer in range(before) if not first <= peer < first + before - after]
+        return np.kron(np.eye(before)[staying], np.eye(SIZE))
+    joining = np.kron(np.full((after - before, before), 1 / before), np.eye(SIZE))
+    return np.vstack([np.eye(SIZE * before), joining])
+
+
+def products(operator: str, first: int) -> dict[int, Floats]:
+    """Return the products of all sequences of up to eight changes from two peers to two, by their length."""
+    steps = {count: all_peers(operator, count) for count in (2, 3, 4)}
+    stacks, result = {2: np.eye(2 * SIZE)[None]}, dict[int, Floats]()
+    for length in range(1, 9):
+        after = {
+            count: np.concatenate(
+                [step @ (change(before, count, first) @ stack) for before, stack in stacks.items()]
+            )
+            for count, step in steps.items()
+        }
+        stacks, result[length] = after, after[2]
+    return result
+
+
+@pytest.mark.parametrize("first", [0, 2])
+@pytest.mark.parametrize("operator", ["mean", "sum"])
+def test_products_of_frames_joins_and_leaves_agree_with_the_verdict(operator: str, first: int) -> None:
+    """All peers, at the mean of the others, and relative to the common translation.
+
+    A growing sequence needs two peers that stay: those that joined leave first.
+    """
+    found = apc.changing_counts(AVERAGE if operator == "mean" else MESH, "user.count=2:4")
+    largest = 0.0
+    for length, stack in products(operator, first).items():
+        values = np.linalg.eigvals(stack)
+        rigid = abs(values - 1).argmin(axis=1)
+        assert abs(values[np.arange(len(values)), rigid] - 1).max() < 1e-9
+        values[np.arange(len(values)), rigid] = 0.0
+        largest = max(largest, float((abs(values).max(axis=1) ** (1 / length)).max()))
+    if found.sequence and first == 2:
+        assert largest > 1
+    else:
+        assert largest < 1
 
 
 def test_a_number_that_is_unstable_alone_is_named() -> None:
