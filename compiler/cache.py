@@ -38,7 +38,7 @@ from apc.compiler.files import RefusedError, listing, read_file
 from apc.compiler.signing import is_sealed, seal
 from apc.compiler.source.reading import fault
 
-FORMAT = 19  # the format version of NAME.apc
+FORMAT = 20  # the format version of NAME.apc
 LARGEST = 256 * 2**20  # bytes of the file
 LARGEST_ORIGIN = 64 * 2**20  # bytes of the third line, which require up to ten times the memory
 SUFFIX = ".yaml"  # of the files in a folder of components

@@ -137,24 +137,25 @@ class Channel:
 class GroupPair:
     """The packets of a link from the group `sender` to the group `receiver`; `delay` is the name of a timing.
 
-    With a `channel` of its own, the pair has a timing of its own, which identifies the channel. `channel` is
-    None for that of the link.
+    With a `channel` or a `clock` of its own, the pair has a timing of its own, which identifies both.
+    `channel` is None, and `clock` empty, for that of the link.
     """
 
     sender: str
     receiver: str
     delay: str
     channel: Channel | None = None
+    clock: str = ""
 
 
 @dataclass(frozen=True, slots=True)
 class Link:
     """A network link, which transfers the values sent by every peer to the receivers.
 
-    `clock` is the name of a clock, `delay` of a timing; `pairs` are the pairs of groups with another delay or
-    channel. `channel` is None for a link without any unreliable pair. `order` is "before" if a packet takes
-    the values before the ticks at its instant, "after" if it takes the values after them; such a packet is
-    received at later ticks only.
+    `clock` is the name of a clock, `delay` of a timing; `pairs` are the pairs of groups with another delay,
+    channel or clock. `channel` is None for a link without any unreliable pair. `order` is "before" if a
+    packet takes the values before the ticks at its instant, "after" if it takes the values after them; such a
+    packet is received at later ticks only.
     """
 
     name: str
@@ -185,6 +186,19 @@ class Link:
         """Return the channel of the packets whose delay is the timing `delay`."""
         named = (pair.channel for pair in self.pairs if pair.delay == delay and pair.channel)
         return next(named, self.channel)
+
+    @property
+    def clocks(self) -> tuple[str, ...]:
+        """The clocks whose ticks send packets, without repetition, first the link's own."""
+        return tuple(dict.fromkeys((self.clock, *(pair.clock for pair in self.pairs if pair.clock))))
+
+    def own_clock(self, delay: str) -> str:
+        """Return the clock of the pairs whose delay is the timing `delay`, empty for that of the link."""
+        return next((pair.clock for pair in self.pairs if pair.delay == delay), "")
+
+    def clock_at(self, delay: str) -> str:
+        """Return the clock that sends the packets whose delay is the timing `delay`."""
+        return self.own_clock(delay) or self.clock
 
 
 @dataclass(frozen=True, slots=True)

@@ -431,17 +431,7 @@ def read_entry(entry: PartEntry, scope: EntryScope, mistakes: Mistakes, index: i
             if outer.unit.dimension != item.unit.dimension:
                 raise fault("E204", node.location, name, item.unit.text, outer.unit.text)
             return word
-        known = scope.references(role, word)
-        if word in known:
-            return word
-        missing = f"not in {role}s" if within is None else f"not a {role} of {within.name}"
-        message = f"{entry.name}: unknown {role} {named(word)} ({missing})"
-        if other := (scope.parts.used or {}).get(word, ""):
-            fix = f"{name}: {next(iter(known))}" if len(known) == 1 else ""
-            got = f"{word}, {other.partition(',')[0]}"
-            choice = f"a {role}" if fix else f"a {role} ({', '.join([*known][:MOST_CHOICES])})"
-            raise fault("E206", node.location, f"{name} of {entry.name}", choice, got, fix)
-        raise unknown("E206", node.location, message, word, known)
+        return read_reference(node, name, role=role, subject=entry.name, scope=scope)
 
     def read_all(items: Iterable[Item], read: Callable[[Item], T | None]) -> Named[T]:
         """Return the values of items by name; missing and invalid items are omitted."""
@@ -483,6 +473,35 @@ def read_entry(entry: PartEntry, scope: EntryScope, mistakes: Mistakes, index: i
         read_all(starts, number),
         tuple(connections),
     )
+
+
+def read_reference(node: Node, key: str, *, role: str, subject: str, scope: EntryScope) -> str:
+    """Return the name of an existing clock, link or table, as `role` is, from the value of a key.
+
+    Parameters
+    ----------
+    node, key, role
+        The value, its key, and what it names.
+    subject, scope
+        The owner of the key for messages, and the names that exist.
+
+    Raises
+    ------
+    ApcError
+        E206 an unknown name.
+    """
+    word, within = text_of(node, key), scope.outer
+    known = scope.references(role, word)
+    if word in known:
+        return word
+    missing = f"not in {role}s" if within is None else f"not a {role} of {within.name}"
+    message = f"{subject}: unknown {role} {named(word)} ({missing})"
+    if other := (scope.parts.used or {}).get(word, ""):
+        fix = f"{key}: {next(iter(known))}" if len(known) == 1 else ""
+        got = f"{word}, {other.partition(',')[0]}"
+        choice = f"a {role}" if fix else f"a {role} ({', '.join([*known][:MOST_CHOICES])})"
+        raise fault("E206", node.location, f"{key} of {subject}", choice, got, fix)
+    raise unknown("E206", node.location, message, word, known)
 
 
 def _undeclared_reference(

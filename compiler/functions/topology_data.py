@@ -135,6 +135,7 @@ def used_links(topology: Topology, peer_types: Sequence[PeerType], timings: Timi
                 pair.receiver,
                 timings.use(pair.timing, pair.delay),
                 _channel(pair.channel, timings),
+                pair.clock,
             )
             for pair in link.pairs
         )
@@ -166,7 +167,7 @@ def used_clocks(
     timings
         The collection to which the periods and phases in use are added.
     """
-    used = {link.clock for link in links} | {
+    used = {clock for link in links for clock in link.clocks} | {
         clock.clock for peer_type in peer_types for clock in peer_type.clocks
     }
     return tuple(

@@ -17,7 +17,7 @@ from functools import partial
 from apc.compiler.compiled import Graph
 from apc.compiler.components.component import Component, Reference
 from apc.compiler.components.component import NumberParameter as Parameter
-from apc.compiler.components.parts import PartEntry
+from apc.compiler.components.parts import EntryScope, PartEntry, read_reference
 from apc.compiler.errors import SourceLocation
 from apc.compiler.language.dimensions import SECOND
 from apc.compiler.language.grammar import parse_expression
@@ -31,15 +31,15 @@ from apc.compiler.topology.topology_parameters import NamedNumbers
 
 # The numbers and options of a link.
 EFFECTIVE = ("delay", "order", "jitter", "distribution", "reorder", "on_loss")
-# The keys of a pair of groups; of a channel, all except `reorder` and `trace`.
-PAIR = ("delay", "loss", "jitter", "distribution", "on_loss")
+# The keys of a pair of groups: of a channel, all except `reorder` and `trace`.
+PAIR = ("delay", "loss", "jitter", "distribution", "on_loss", "clock")
 
 
 @dataclass(frozen=True, slots=True)
 class PairDeclaration:
     """The packets of a link from the group `sender` to the group `receiver`.
 
-    `timing` is the name of the delay; `channel` is None for that of the link.
+    `timing` is the name of the delay; `channel` is None, and `clock` empty, for that of the link.
     """
 
     sender: str
@@ -48,6 +48,7 @@ class PairDeclaration:
     delay: ScalarValue
     channel: ChannelDeclaration | None
     location: SourceLocation
+    clock: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,7 +124,9 @@ def _range(
     return low, high
 
 
-def read_link(part: PartInstance, entry: PartEntry, numbers: NamedNumbers) -> LinkDeclaration:
+def read_link(
+    part: PartInstance, entry: PartEntry, numbers: NamedNumbers, scope: EntryScope
+) -> LinkDeclaration:
     """Return the declaration of a link: graph, delays and channel, read from its entry.
 
     Parameters
@@ -132,6 +135,8 @@ def read_link(part: PartInstance, entry: PartEntry, numbers: NamedNumbers) -> Li
         The link as a part, and its entry.
     numbers
         The named numbers: groups of peers, reader of delays and files, collector of errors.
+    scope
+        The names that the entry can refer to.
 
     Raises
     ------
@@ -164,7 +169,7 @@ def read_link(part: PartInstance, entry: PartEntry, numbers: NamedNumbers) -> Li
         ends = _range(node, part.name, component, numbers)
         delay_range = ends[0].number, ends[1].number
         delay = ScalarValue((delay_range[0] + delay_range[1]) / 2, ends[0].dimension, None, node.location)
-    pairs = _PairReader(part, graph, delay, channel, numbers).read(nodes)
+    pairs = _PairReader(part, graph, delay, channel, numbers, scope).read(nodes)
     if clock is None or delay is None:
         raise AlreadyReportedError
     reliable = channel.reliable and all(pair.channel is None for pair in pairs)
@@ -176,13 +181,17 @@ def read_link(part: PartInstance, entry: PartEntry, numbers: NamedNumbers) -> Li
 
 @dataclass(frozen=True, slots=True)
 class _PairReader:
-    """Reads the pairs of groups of a link, given its graph, delay (None if invalid) and channel."""
+    """Reads the pairs of groups of a link, given its graph, delay (None if invalid) and channel.
+
+    `scope` has the names of the clocks.
+    """
 
     link: PartInstance
     graph: Graph
     delay: ScalarValue | None
     channel: ChannelDeclaration
     numbers: NamedNumbers
+    scope: EntryScope
 
     def read(self, nodes: Mapping[str, Node]) -> tuple[PairDeclaration, ...]:
         """Return the pairs of the nodes of `delays` and `pairs`; mistakes are recorded."""
@@ -212,7 +221,7 @@ class _PairReader:
         return PairDeclaration(sender, receiver, timing, delay, None, node.location)
 
     def _pair(self, sender: str, receiver: str, node: Node) -> PairDeclaration:
-        """Return a pair with its delay, which by default follows that of the link, and its channel."""
+        """Return a pair with its delay, which by default follows that of the link, channel and clock."""
         name, subject = f"{self.link.name}.pairs.{sender}.{receiver}", f"the pair {sender} to {receiver}"
         fix = f"{receiver}: {{loss: 2 %}}"
         if isinstance(node, Scalar) and is_quantity(node.text) and not node.text.endswith("%"):
@@ -228,7 +237,11 @@ class _PairReader:
             ScalarValue(common, SECOND, following, node.location),
         )
         channel = read_pair_channel(name, body, self.link.component, self.channel, self.numbers)
-        return PairDeclaration(sender, receiver, f"{name}.delay", delay, channel, node.location)
+        clock = body.read(
+            "clock", partial(read_reference, role="clock", subject=subject, scope=self.scope), ""
+        )
+        clock = "" if clock == self.link.reference("clock") else clock
+        return PairDeclaration(sender, receiver, f"{name}.delay", delay, channel, node.location, clock)
 
     @property
     def _declared_delay(self) -> Parameter:

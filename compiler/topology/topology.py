@@ -213,7 +213,7 @@ def build_topology(source: Source, library: Library) -> Topology:
     for part in parts:
         if part.section == "links" and "." not in part.name:
             with mistakes:
-                links.append(read_link(part, entries[part.name], numbers))
+                links.append(read_link(part, entries[part.name], numbers, scope))
     others = tuple(part for part in parts if part.section != "links")
     group_reader = GroupReader(
         settable_names(others), others, redeclared_entries, clocks, numbers, names.explain

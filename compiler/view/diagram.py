@@ -198,7 +198,11 @@ def _link_box(link: LinkDeclaration) -> Box:
     lines = (link.name, shape_of(link), f"one packet per tick of {link.clock}", later)
     pairs = (
         ", ".join(
-            (f"{pair.sender} to {pair.receiver}: delay {seconds(pair.delay.number)}", *_remarks(pair.channel))
+            (
+                f"{pair.sender} to {pair.receiver}: delay {seconds(pair.delay.number)}",
+                *[f"one packet per tick of {pair.clock}"] * bool(pair.clock),
+                *_remarks(pair.channel),
+            )
         )
         for pair in link.pairs
     )

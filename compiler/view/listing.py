@@ -186,7 +186,7 @@ def schedule(system: Model) -> dict[str, Any]:
                         for name in item.outputs
                     )
                 ],
-                "sends": [link.name for link in system.links if link.clock == clock.name],
+                "sends": [link.name for link in system.links if clock.name in link.clocks],
             }
             for clock in system.clocks
         ],
@@ -215,15 +215,15 @@ def schedule(system: Model) -> dict[str, Any]:
                         for name in send.channels
                     )
                 ],
-                "period_s": float(periods[link.clock]),
+                "period_s": float(periods[clock]),
                 "delay_s": float(timings[delay]),
-                "on_the_way": math.ceil(timings[delay] / periods[link.clock]),
-                "age_s": [float(timings[delay]), float(timings[delay] + periods[link.clock])],
+                "on_the_way": math.ceil(timings[delay] / periods[clock]),
+                "age_s": [float(timings[delay]), float(timings[delay] + periods[clock])],
             }
             for link in system.links
-            for sender, receiver, delay in (
-                ("", "", link.delay),
-                *((pair.sender, pair.receiver, pair.delay) for pair in link.pairs),
+            for sender, receiver, delay, clock in (
+                ("", "", link.delay, link.clock),
+                *((pair.sender, pair.receiver, pair.delay, pair.clock or link.clock) for pair in link.pairs),
             )
         ],
         "receives": [

@@ -488,6 +488,9 @@ def _refuse_unsupported(system: Model, exchange: CommunicationGraph) -> None:
         if link.after:
             message = f"packets of {link.name} that take the values after the ticks (order: after)"
             raise _refused(system, message, "use order: before, or apc simulate")
+        if len(link.clocks) > 1:
+            message = f"different clocks of the pairs of groups of {link.name}"
+            raise _refused(system, message, "use one link for each clock, or apc simulate")
     for peer_type in system.peer_types:
         for function, _, message, _ in [
             (peer_type.derivative, "", "what moves", ""),

@@ -320,6 +320,9 @@ def _refuse_iterations(system: Model, name: str, peer_type: PeerType) -> None:
         message = f"packets of {after[0]} take the values after the ticks (order: after)"
         advice = "use order: before, or apc run"
         raise refused(system, f"{message}, which is not exported to C", advice=advice)
+    if several := [link.name for link in system.links if len(link.clocks) > 1]:
+        message = f"pairs of groups of {several[0]} have different clocks, which is not exported to C"
+        raise refused(system, message, advice="use one link for each clock, or apc simulate")
     for function, when, message, where in instant_functions(peer_type):
         if not function.is_a("SXFunction"):
             message = f"{name}: {when}{message}{where} need an iteration, which is not exported to C"

@@ -135,7 +135,7 @@ def _fastest_clock(system: Model) -> tuple[Fraction, Fraction]:
     """Return the period and phase of the fastest clock in use, in seconds."""
     timings = resolve(system).timings
     used = {part.clock for peer_type in system.peer_types for part in peer_type.clocks} | {
-        link.clock for link in system.links
+        clock for link in system.links for clock in link.clocks
     }
     clocks = [clock for clock in system.clocks if clock.name in used]
     if not clocks:

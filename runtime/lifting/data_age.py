@@ -145,17 +145,21 @@ def _ages_of_ticks(
     if not links:
         return ()
     clock_of = {clock.name: clock for clock in system.clocks}
-    names = [partition.clock, *(exchange.links[link].clock for link in links)]
+    delay_by_link, clock_by_link = dict[str, Fraction](), dict[str, str]()
+    for link in links:
+        delay_name = _single_delay(system, exchange, timings, peer_type_index, link)
+        delay_by_link[link] = timings[delay_name]
+        clock_by_link[link] = exchange.links[link].clock_at(delay_name)
+    names = [partition.clock, *clock_by_link.values()]
     period = {name: timings[clock_of[name].period] for name in names}
     phase = {name: timings[clock_of[name].phase] % period[name] for name in names}
     tick_period = period[partition.clock]
-    delay_by_link = {link: _single_delay(system, exchange, timings, peer_type_index, link) for link in links}
     result = []
     for tick in range(int(common_multiple(period.values()) / tick_period)):
         time = phase[partition.clock] + tick * tick_period
         ages = []
         for link in links:
-            clock, rank = exchange.links[link].clock, order.index
+            clock, rank = clock_by_link[link], order.index
             missed = period[clock] if delay_by_link[link] == 0 and rank("deliver") < rank("send") else 0
             waited = (time - delay_by_link[link] - phase[clock]) % period[
                 clock
@@ -174,13 +178,13 @@ def _single_delay(
     timings: Mapping[str, Fraction],
     peer_type_index: int,
     link: str,
-) -> Fraction:
-    """Return the delay in seconds with which all peers of a type receive from all others over a link.
+) -> str:
+    """Return the timing of the delay with which all peers of a type receive from all others over a link.
 
     Raises
     ------
     ApcError
-        E811 several delays.
+        E811 several delays, or packets at several clocks.
     """
     receivers = [index for index, group in enumerate(system.groups) if group.peer_type == peer_type_index]
     delay_names = {
@@ -189,8 +193,8 @@ def _single_delay(
         for sender in range(len(system.groups))
         if sender != receiver or system.groups[sender].count > 1
     }
-    delays = {timings[name] for name in delay_names or {exchange.default_delay[link]}}
-    if len(delays) > 1:
+    delay_names = delay_names or {exchange.default_delay[link]}
+    if len({(timings[name], exchange.links[link].clock_at(name)) for name in delay_names}) > 1:
         names = ", ".join(sorted(delay_names))
         message = (
             f"the age of samples received by {system.peer_types[peer_type_index].name} over {link} differs "
@@ -199,7 +203,7 @@ def _single_delay(
         raise ApcError(
             Diagnostic("E811", SourceLocation(system.origin.topology), message, fix="apc simulate")
         )
-    return delays.pop()
+    return min(delay_names)
 
 
 @functools.lru_cache(maxsize=CACHE_SIZE)

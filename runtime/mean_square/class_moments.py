@@ -528,7 +528,8 @@ def stored_of(
     times = {clock.name: instants(reception, clock) for clock in system.clocks}
     for route, selected in sorted(received.items()):
         link, delay = links[route[0]], reception.timings[route[1]]
-        sent = times[link.clock]
+        clock = selected[0].coupling_term.clock
+        sent = times[clock or link.clock]
         ticks = {(row.clock, row.tick): times[row.clock][row.tick] for row in selected}
         law = PERFECT if perfect or link.channel is None else channel_law(system, link, route[1])
         error_bound = lost.get(route, (0.0,))
@@ -542,7 +543,7 @@ def stored_of(
             after=link.after,
             lost=error_bound,
         )
-        memories.append(route_memory(route, memory, sorted({row.channel for row in selected})))
+        memories.append(route_memory(route, memory, sorted({row.channel for row in selected}), clock))
     return memories
 
 

@@ -89,7 +89,7 @@ def forced(system: Model, reception: PerTickReception, first: Fraction = Fractio
     unit_of = {parameter.name: parameter.unit for parameter in system.parameters}
     direct = coupled_directly(system.peer_types)
     used_clocks = {part.clock for peer_type in system.peer_types for part in peer_type.clocks} | {
-        link.clock for link in system.links
+        clock for link in system.links for clock in link.clocks
     }
     fastest = min(
         (clock for clock in system.clocks if clock.name in used_clocks),

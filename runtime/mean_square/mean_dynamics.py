@@ -58,6 +58,7 @@ FINEST = (10**6, 10**4, 100)
 class RouteMemory:
     """The memory of a link's packets with one delay, equal for each of its `channels`.
 
+    `clock` is the own clock of the pairs of groups, empty for that of the link.
     `after` is each value after all packets are sent, over [stored values, packets sent, noise].
     `reception_errors` is, for each slot, the difference between the content of its packet and its uncertain
     values before the packet.
@@ -68,6 +69,7 @@ class RouteMemory:
     channels: tuple[str, ...]
     after: Matrix
     reception_errors: tuple[Matrix, ...]
+    clock: str
 
     @property
     def sizes(self) -> list[int]:
@@ -127,7 +129,9 @@ class MeanLoop:
     reception_errors: Mapping[tuple[int, Route, int], Matrix]
 
 
-def route_memory(route: Route, memory: ReceiverMemory, channels: Sequence[str]) -> RouteMemory:
+def route_memory(
+    route: Route, memory: ReceiverMemory, channels: Sequence[str], clock: str = ""
+) -> RouteMemory:
     """Return the memory of a route after one frame: its values over stored values, sent packets and noise."""
     count, slots = memory.count, memory.slots
     sizes = [len(memory.uncertain(slot)) for slot in range(slots)]
@@ -150,7 +154,7 @@ def route_memory(route: Route, memory: ReceiverMemory, channels: Sequence[str]) 
         after[:, uncertain, count + slot] = chance
         after[0, uncertain, first + np.arange(size)] = 1.0
         first += size
-    return RouteMemory(route, memory, tuple(channels), after, tuple(reception_errors))
+    return RouteMemory(route, memory, tuple(channels), after, tuple(reception_errors), clock)
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,7 +195,7 @@ def with_memory(
         (item, channel)
         for item in memory
         for channel in item.channels
-        if SentSample(item.route[0], channel, 0) in row_of
+        if SentSample(item.route[0], channel, 0, item.clock) in row_of
     ]
     counts = [item.memory.count for item, _ in numbers]
     firsts, n_m, n_s = np.cumsum([0, *counts]), sum(counts), len(row_of)
@@ -202,9 +206,8 @@ def with_memory(
         values = np.zeros((len(block), block.shape[-2], n_m + n_s))
         values[..., firsts[index] : firsts[index + 1]] = block[..., : memory.memory.count]
         for slot in range(memory.memory.slots):
-            values[..., n_m + row_of[SentSample(memory.route[0], channel, slot)]] = block[
-                ..., memory.memory.count + slot
-            ]
+            row = row_of[SentSample(memory.route[0], channel, slot, memory.clock)]
+            values[..., n_m + row] = block[..., memory.memory.count + slot]
         return values
 
     rows, stored = list[Matrix](), list[Matrix]()

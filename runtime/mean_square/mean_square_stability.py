@@ -276,7 +276,7 @@ def _other_coupling(system: Model, link: Link) -> str:
 def _overtakes(system: Model, link: Link, law: ChannelLaw) -> bool:
     """Return whether a packet may arrive before a packet sent earlier."""
     timings = resolve(system).timings
-    period = next(timings[clock.period] for clock in system.clocks if clock.name == link.clock)
+    period = min(timings[clock.period] for clock in system.clocks if clock.name in link.clocks)
     least = max(law.delay - law.jitter * EARLIEST[law.distribution], 0.0)
     return law.longest - least >= float(period)
 

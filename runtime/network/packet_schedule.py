@@ -52,14 +52,16 @@ def instant_of(seconds: float, quantum: Fraction) -> Fraction:
 class Route:
     """The samples received over one unreliable link at the ticks of one clock.
 
-    `pairs` (M, 2) are the peers (sender, receiver), counted from 0, receiver by receiver, `weights` (M,) the
-    graph's weights; `longest` is the link's longest time in seconds from a packet's sample to its arrival. A
-    frame has `ticks` ticks of the clock and `slots` sending slots of the link; packets are stored for
-    `frames` frames. `zero` states whether a receiver substitutes its own value for a missing sample.
+    `sent_by` is the pairs' own clock, whose ticks send the packets; empty for that of the link. `pairs`
+    (M, 2) are the peers (sender, receiver), counted from 0, receiver by receiver, `weights` (M,) the graph's
+    weights; `longest` is the link's longest time in seconds from a packet's sample to its arrival. A frame
+    has `ticks` ticks of the clock and `slots` sending slots; packets are stored for `frames` frames. `zero`
+    states whether a receiver substitutes its own value for a missing sample.
     """
 
     link: str
     clock: str
+    sent_by: str
     pairs: Integers
     weights: Floats
     longest: float
@@ -151,6 +153,7 @@ def arrival_process_of(
         clock.name: (timings[clock.phase] / quantum, timings[clock.period] / quantum)
         for clock in system.clocks
     }
+    sending_clock = grids[route.sent_by or link.clock]
     groups, group_pair_of = _group_pairs(exchange, route.pairs)
     least = int(link.after)
     pair_delays = [exchange.delay(link.name, *pair) for pair in groups]
@@ -160,8 +163,8 @@ def arrival_process_of(
         laws=tuple(channel_law(system, link, delay) for delay in delays),
         law_of=law_of,
         nominal=np.array([max(int(timings[delay] / quantum), least) for delay in delays], np.int64)[law_of],
-        phase=int(grids[link.clock][0]),
-        period=int(grids[link.clock][1]),
+        phase=int(sending_clock[0]),
+        period=int(sending_clock[1]),
         tick_phase=int(grids[route.clock][0]),
         tick_period=int(grids[route.clock][1]),
         quantum=quantum,
@@ -392,7 +395,7 @@ def _link_receivers(
 def routes_of(
     system: Model, timings: Mapping[str, Fraction], exchange: CommunicationGraph, frame_s: Fraction
 ) -> tuple[Route, ...]:
-    """Return the routes: one per unreliable link and per clock that receives from it.
+    """Return the routes: one per unreliable link, per clock that receives from it, and per clock that sends.
 
     Parameters
     ----------
@@ -418,7 +421,7 @@ def _routes_over(
     frame_s: Fraction,
     link: Link,
 ) -> list[Route]:
-    """Return the routes of a link: its directed links, grouped by the clock of their receivers."""
+    """Return the routes of a link: its directed links, grouped by the clocks of receivers and of packets."""
     peers = exchange.peers
     if link.graph.shape == "complete" and peers * (peers - 1) > MOST_ARCS:
         message = (
@@ -433,12 +436,14 @@ def _routes_over(
     sends = np.array(
         [any(send.link == link.name for send in peer_type.sends) for peer_type in system.peer_types]
     )
-    used = {}
+    used: dict[tuple[str, str], tuple[Integers, Floats]] = {}
     for clock in system.clocks:
         receives = np.array([_receives(peer_type, link.name, clock.name) for peer_type in system.peer_types])
         arcs = sends[peer_type_of[pairs[:, 0]]] & receives[peer_type_of[pairs[:, 1]]]
-        if arcs.any():
-            used[clock.name] = pairs[arcs], weights[arcs]
+        sent_by = _own_clocks(exchange, link, pairs)
+        for name in sorted({*sent_by[arcs].tolist()}):
+            of_clock = arcs & (sent_by == name)
+            used[clock.name, name] = pairs[of_clock], weights[of_clock]
     groups = {pair for clock_pairs, _ in used.values() for pair in _group_pairs(exchange, clock_pairs)[0]}
     delays = {exchange.delay(link.name, *pair) for pair in groups}
     longest = max((channel_law(system, link, delay).longest for delay in delays), default=0.0)
@@ -447,17 +452,25 @@ def _routes_over(
         Route(
             link=link.name,
             clock=clock,
+            sent_by=sent_by,
             pairs=clock_pairs,
             weights=clock_weights,
             longest=longest,
             ticks=int(frame_s / periods[clock]),
-            slots=int(frame_s / periods[link.clock]),
+            slots=int(frame_s / periods[sent_by or link.clock]),
             # A packet is received at most one tick after it arrives, and a clock ticks in every frame.
             frames=math.ceil(longest / float(frame_s)) + 1,
             zero=any(channel.on_loss == "zero" for channel in link.channels),
         )
-        for clock, (clock_pairs, clock_weights) in used.items()
+        for (clock, sent_by), (clock_pairs, clock_weights) in used.items()
     ]
+
+
+def _own_clocks(exchange: CommunicationGraph, link: Link, pairs: Integers) -> NDArray[np.str_]:
+    """Return the own clock (M,) of each directed link, empty for that of the link."""
+    groups, of_pair = _group_pairs(exchange, pairs)
+    clocks = [link.own_clock(exchange.delay(link.name, *pair)) for pair in groups]
+    return np.array(clocks, np.str_)[of_pair]
 
 
 def _receives(peer_type: PeerType, link: str, clock: str) -> bool:

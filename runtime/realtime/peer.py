@@ -385,7 +385,12 @@ class _SinglePeer(InterpretedEngine):
         self.quantum_ns = simulation.quantum * NANO
         schedules = [member.program.schedule for member in population.members]
         self.begin_at = [0, *(int(number * self.quantum_ns) for number in instants_within(schedules))]
-        self.links = [_LinkState(loop, period, index) for index in range(len(loop.system.links))]
+        self.links = [
+            _LinkState(loop, period, index, clock)
+            for index, link in enumerate(loop.system.links)
+            for clock in link.clocks
+        ]
+        self.link_of = {(link.location, sender): link for link in self.links for sender in link.arcs}
         self.newest = [np.full(len(route.pairs), START, np.int64) for route in self.routes]
         self.observed: list[list[tuple[Integers, Flags]]] = [[] for _ in self.routes]
         self.network = _EmulatedNetwork(loop) if emulate else None
@@ -523,8 +528,10 @@ class _SinglePeer(InterpretedEngine):
         """Take the packets sampled until the present instant into effect."""
         while self.ahead and self.ahead[0][0] <= self.instant:
             _, _, packet = heapq.heappop(self.ahead)
-            link = self.links[packet.link]
-            for route_index, arc in link.arcs.get(packet.sender, ()):
+            link = self.link_of.get((packet.link, packet.sender))
+            if link is None:  # the sender has left
+                continue
+            for route_index, arc in link.arcs[packet.sender]:
                 last = self.newest[route_index][arc]
                 self.newest[route_index][arc] = max(last, packet.count) if link.newest else packet.count
 
@@ -532,9 +539,11 @@ class _SinglePeer(InterpretedEngine):
         """Send the packets of a segment, each at its instant or, if emulated, at its arrival time."""
         loop, member = self.loop, self.population.members[self.member]
         sent = member.program.schedule.sent
-        slots = {(sent[row].link, sent[row].slot) for row in member.program.segments[index].sent}
-        for name, slot in sorted(slots):
-            link = next(link for link in self.links if link.name == name)
+        slots = {
+            (sent[row].link, sent[row].clock, sent[row].slot) for row in member.program.segments[index].sent
+        }
+        for name, clock, slot in sorted(slots):
+            link = next(link for link in self.links if (link.name, link.own_clock) == (name, clock))
             count = number * link.slots + slot
             keys = [link.keys[channel, slot] for channel in link.channels_of(loop.local)]
             column = self.column_of[loop.local]
@@ -555,11 +564,14 @@ class _SinglePeer(InterpretedEngine):
 
     def receive(self, packet: Data, came: int) -> None:
         """Store a packet that arrived at an instant of the session, unless its contents are invalid."""
-        link = self.links[packet.link] if packet.link < len(self.links) else None
-        if why := "malformed" if link is None else self._drop_reason(packet, came, link):
+        link = self.link_of.get((packet.link, packet.sender))
+        if link is None:
+            absent = self.loop.simulation.presence and packet.link < len(self.loop.system.links)
+            self.loop.post.drop("absent" if absent else "malformed")
+            return
+        if why := self._drop_reason(packet, came, link):
             self.loop.post.drop(why)
             return
-        assert link is not None
         exchange_program, (frame, slot) = self.population.exchange_program, divmod(packet.count, link.slots)
         link.counts.setdefault(packet.sender, set()).add(packet.count)
         keys = [link.keys[channel, slot] for channel in link.channels_of(packet.sender)]
@@ -569,8 +581,6 @@ class _SinglePeer(InterpretedEngine):
 
     def _drop_reason(self, packet: Data, came: int, link: _LinkState) -> str:
         """Return the reason for dropping a packet, "" if it is valid."""
-        if packet.sender not in link.arcs:
-            return "absent" if self.loop.simulation.presence else "malformed"
         if len(packet.values) != len(link.channels_of(packet.sender)):
             return "malformed"
         if not self.loop.begins:
@@ -587,32 +597,38 @@ class _SinglePeer(InterpretedEngine):
 
 
 class _LinkState:
-    """The data of a link at one peer, in a period; peers are numbered among all peers.
+    """The data of a link's packets that one clock sends, at one peer, in a period.
 
-    `location` is the index of the link, `name` its name, `slots` the number of packets per frame; `receivers`
-    are the peers that receive from this peer. `channels` are the channels that each peer sends over the link,
-    in the order of a packet's values, and `keys` their storage keys. `arcs` are the routes and directed links
-    of each sender, `counts` the numbers of the packets received from each sender.
+    `location` is the index of the link, `name` its name, `own_clock` the clock of pairs of groups, empty for
+    that of the link; `slots` is the number of packets per frame; `receivers` are the peers that receive from
+    this peer. `channels` are the channels that each peer sends over the link, in the order of a packet's
+    values, and `keys` their storage keys. `arcs` are the routes and directed links of each sender, `counts`
+    the numbers of the packets received from each sender. Peers are numbered among all peers.
     """
 
-    def __init__(self, loop: PeerLoop, period: Period, index: int) -> None:
+    def __init__(self, loop: PeerLoop, period: Period, index: int, clock_name: str) -> None:
         population, peers = period.simulation.population, period.peers
         self.location, self.name = index, loop.system.links[index].name
         link, timings = loop.system.links[index], resolve(loop.system).timings
-        clock = next(clock for clock in loop.system.clocks if clock.name == link.clock)
+        self.own_clock = "" if clock_name == link.clock else clock_name
+        stream = self.name, self.own_clock
+        clock = next(clock for clock in loop.system.clocks if clock.name == clock_name)
         self.phase, self.period = (timings[text] * NANO for text in (clock.phase, clock.period))
         self.newest = link.channel is None or link.channel.reorder == "newest"
         self.slots = int(loop.simulation.frame * loop.simulation.quantum * NANO / self.period)
         self.channels: dict[int, list[str]] = {}
         for member in population.members:
-            sent = sorted({sent.channel for sent in member.program.schedule.sent if sent.link == self.name})
+            samples = member.program.schedule.sent
+            sent = sorted({sent.channel for sent in samples if (sent.link, sent.clock) == stream})
             self.channels |= dict.fromkeys(peers[member.peers].tolist(), sent)
         rows = enumerate(population.exchange_program.keys)
-        self.keys = {(sent.channel, sent.slot): row for row, sent in rows if sent.link == self.name}
+        self.keys = {
+            (sent.channel, sent.slot): row for row, sent in rows if (sent.link, sent.clock) == stream
+        }
         self.receivers: set[int] = set()
         self.arcs: dict[int, list[tuple[int, int]]] = {}
         for route_index, route in enumerate(population.exchange_program.routes):
-            pairs = peers[route.pairs].tolist() if route.link == self.name else ()
+            pairs = peers[route.pairs].tolist() if (route.link, route.sent_by) == stream else ()
             for arc, (sender, receiver) in enumerate(pairs):
                 if sender == loop.local:
                     self.receivers.add(receiver)

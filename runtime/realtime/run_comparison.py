@@ -24,6 +24,7 @@ from apc.lifting.numeric_model import numeric_model
 from apc.mean_square.mean_square_stability import MeanSquareStability, mean_square_stability
 from apc.network.link_fit import LinkFit, fit_delays
 from apc.network.packet_schedule import START, DeliveredPackets
+from apc.parameter_values.parameters import resolve
 from apc.realtime.peer import live_topology, traced
 from apc.realtime.peer_run import PeerRun, RealtimeRun, delays_of, trace_name
 from apc.result import Result
@@ -31,6 +32,7 @@ from apc.simulation.output_blocks import blocks
 from apc.simulation.population import Population
 from apc.simulation.settings import Settings
 from apc.simulation.simulation import Simulation, prepare
+from apc.timing.communication_graph import build_exchange
 
 Floats = NDArray[np.float64]
 
@@ -248,12 +250,16 @@ def _arc_runs(run: RealtimeRun) -> tuple[ArcRun, ...]:
     system, peers = run.system, {peer.number: peer for peer in run.peers}
     timings = {timing.name: float(timing.value) for timing in system.timings}
     periods = {clock.name: timings[clock.period] for clock in system.clocks}
+    exchange = build_exchange(system, resolve(system).timings)
     arc_runs = []
     for peer in run.peers:
         for number, sender in peer.arcs:
             link, trace = system.links[number], trace_name(system, number, sender, peer.number)
             other = peers.get(sender)
-            came = fit_delays(delays_of(peer, number, sender), trace, interval=periods[link.clock])
+            clock = link.clock_at(
+                exchange.delay(link.name, exchange.group_of(sender), exchange.group_of(peer.number))
+            )
+            came = fit_delays(delays_of(peer, number, sender), trace, interval=periods[clock])
             arc_runs.append(
                 ArcRun(
                     link=link.name,
@@ -274,11 +280,14 @@ def _measured_link(system: Model, link: Link, arcs: Sequence[ArcRun]) -> Measure
     tick = min(float(timing.value) for timing in system.timings if timing.name in clocks.values())
     median = dict(came.quantiles).get(0.5, came.mean)
     delay = Fraction(int(np.ceil(median / tick - 1e-9))) * Fraction(tick).limit_denominator(10**9)
+    pairs = tuple(replace(pair, channel=None) for pair in link.pairs if pair.clock)
+    replaced = {link.delay, *(pair.delay for pair in pairs)}
     timings = tuple(
-        replace(timing, value=delay) if timing.name == link.delay else timing for timing in system.timings
+        replace(timing, value=delay) if timing.name in replaced else timing for timing in system.timings
     )
-    period = next(float(timing.value) for timing in timings if timing.name == clocks[link.clock])
-    measured_link = replace(traced(link, came.delays), pairs=())
+    periods = [clocks[name] for name in link.clocks]
+    period = min(float(timing.value) for timing in timings if timing.name in periods)
+    measured_link = replace(traced(link, came.delays), pairs=pairs)
     links = tuple(measured_link if item is link else item for item in system.links)
     measured_system = replace(system, timings=timings, links=links)
     too_long = came.longest > LATEST * period or came.packets > LONGEST

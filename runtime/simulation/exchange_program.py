@@ -183,7 +183,9 @@ class _ExchangeBuilder:
         self, exchange: CommunicationGraph, members: Sequence[GroupProgram], routes: Sequence[Route]
     ) -> None:
         self.exchange, self.members, self.routes = exchange, members, tuple(routes)
-        self.route_of = {(route.link, route.clock): index for index, route in enumerate(routes)}
+        self.route_of = {
+            (route.link, route.clock, route.sent_by): index for index, route in enumerate(routes)
+        }
         self.first = np.cumsum([0, *(member.count for member in members)])
         self.member_of = np.empty(exchange.peers, np.int64)  # of each peer of the model
         self.index_in = np.empty(exchange.peers, np.int64)  # among that member's peers
@@ -194,7 +196,10 @@ class _ExchangeBuilder:
         self.keys = tuple(sorted({sent for member in members for sent in member.program.schedule.sent}))
         self.key_of = {sent: index for index, sent in enumerate(self.keys)}
         self.channels = [
-            sorted({sent.channel for sent in self.keys if sent.link == route.link}) for route in routes
+            sorted(
+                {sent.channel for sent in self.keys if (sent.link, sent.clock) == (route.link, route.sent_by)}
+            )
+            for route in routes
         ]
         self.sending = {
             link: np.array([any(send.link == link for send in m.program.peer_type.sends) for m in members])
@@ -211,7 +216,8 @@ class _ExchangeBuilder:
                 start[key, self.first[g] : self.first[g + 1]] = _first_packet(member, sent.link, sent.channel)
         channels = tuple(
             np.array([
-                [self.key_of[SentSample(route.link, c, slot)] for slot in range(route.slots)] for c in channel
+                [self.key_of[SentSample(route.link, c, k, route.sent_by)] for k in range(route.slots)]
+                for c in channel
             ])
             for route, channel in zip(self.routes, self.channels, strict=True)
         )  # fmt: skip
@@ -255,16 +261,11 @@ class _ExchangeBuilder:
             ]
             for position, pairwise in enumerate(segment.pairs, len(segment.received)):
                 rows = [input_rows[row] for row in pairwise.received]
-                pairs += [
-                    (rows[0], reduction)
-                    for reduction in self._pairwise_reductions(g, position, pairwise, rows)
-                ]
+                pairs += self._pairwise_reductions(g, position, pairwise, rows)
             for received, operation in pairs:
                 if isinstance(received, UncertainSample):
                     group = before_delivery if received.coupling_term.before else after_delivery
-                    group.setdefault(
-                        (self.route_of[received.coupling_term.link, received.clock], received.tick), []
-                    ).append(operation)
+                    group.setdefault((self._route(received), received.tick), []).append(operation)
                 else:
                     operations.append(operation)
         for route, tick in sorted({*after_delivery, *before_delivery}):
@@ -275,11 +276,17 @@ class _ExchangeBuilder:
             ]
         return tuple(operations)
 
+    def _route(self, row: ReceivedSample | UncertainSample) -> int:
+        """Return the index of the route of a received row of the schedule, −1 over a reliable link."""
+        if isinstance(row, ReceivedSample):
+            return -1
+        return self.route_of[row.coupling_term.link, row.clock, row.coupling_term.clock]
+
     def _source(self, row: ReceivedSample | UncertainSample) -> Source:
         """Return the source of a received row of the schedule."""
         if isinstance(row, ReceivedSample):
             return PacketKey(self.key_of[row.sent], row.lag)
-        route = self.route_of[row.coupling_term.link, row.clock]
+        route = self._route(row)
         channel = self.channels[route]
         return Arrived(route, len(channel) if row.gap else channel.index(row.channel))
 
@@ -315,9 +322,9 @@ class _ExchangeBuilder:
         index: int,
         pairwise: Pairwise,
         rows: Sequence[ReceivedSample | UncertainSample],
-    ) -> list[Operation]:
+    ) -> list[tuple[ReceivedSample | UncertainSample, Operation]]:
         """Return the operations that compute one pairwise reduction of a member, one operation for each
-        delay.
+        delay, in the order of routes, each with one of its received rows.
 
         Parameters
         ----------
@@ -332,32 +339,31 @@ class _ExchangeBuilder:
             unreliable link that of the missing packets.
         """
         function_index = self.functions.setdefault(pairwise.function, len(self.functions))
-        reductions: list[Operation] = []
-        for delay in dict.fromkeys(row.coupling_term.delay for row in rows):
+        reductions: list[tuple[ReceivedSample | UncertainSample, Operation]] = []
+        for delay in dict.fromkeys(row.coupling_term.delay for row in sorted(rows, key=self._route)):
             rows_of_delay = [row for row in rows if row.coupling_term.delay == delay]
             arcs = self._arcs(member_index, rows_of_delay[0])
             missing_sources = [
                 self._source(row) for row in rows_of_delay if isinstance(row, UncertainSample) and row.gap
             ]
-            reductions.append(
-                PairwiseReduction(
-                    member=member_index,
-                    row=index,
-                    function=function_index,
-                    pairwise=pairwise,
-                    operator=rows_of_delay[0].coupling_term.operator,
-                    first=not reductions,
-                    sources=tuple(
-                        self._source(row)
-                        for row in rows_of_delay
-                        if isinstance(row, ReceivedSample) or not row.gap
-                    ),
-                    missing=next((source for source in missing_sources if isinstance(source, Arrived)), None),
-                    senders=arcs.senders,
-                    receivers=arcs.receivers,
-                    weights=arcs.weights,
-                )
+            reduction = PairwiseReduction(
+                member=member_index,
+                row=index,
+                function=function_index,
+                pairwise=pairwise,
+                operator=rows_of_delay[0].coupling_term.operator,
+                first=not reductions,
+                sources=tuple(
+                    self._source(row)
+                    for row in rows_of_delay
+                    if isinstance(row, ReceivedSample) or not row.gap
+                ),
+                missing=next((source for source in missing_sources if isinstance(source, Arrived)), None),
+                senders=arcs.senders,
+                receivers=arcs.receivers,
+                weights=arcs.weights,
             )
+            reductions.append((rows_of_delay[0], reduction))
         return reductions
 
     # ---- communication graph
@@ -365,27 +371,30 @@ class _ExchangeBuilder:
     def _arcs(self, member_index: int, row: ReceivedSample | UncertainSample) -> _Arcs:
         """Return the arcs of a coupling term to the peers of a member, with their weights."""
         coupling_term, clock = row.coupling_term, row.clock if isinstance(row, UncertainSample) else ""
-        key = (member_index, coupling_term, clock)
+        key, link = (member_index, coupling_term, clock), coupling_term.link
         if key not in self.arcs:
-            senders, receivers, weights, members = self._all_arcs(member_index, coupling_term.link, clock)
+            senders, receivers, weights, members = self._all_arcs(member_index, link, self._route(row))
             if coupling_term.operator != "sum":
-                totals = self._checked_weight_sums(member_index, coupling_term, receivers, weights)
+                of_all = self._all_arcs(member_index, link)[
+                    1:3
+                ]  # the route may have some of the senders only
+                totals = self._checked_weight_sums(member_index, coupling_term, *of_all)
                 weights = weights / totals[receivers] if coupling_term.operator == "mean" else weights
             group = self.members[member_index].group
-            delays = [self.exchange.delay(coupling_term.link, member.group, group) for member in self.members]
+            delays = [self.exchange.delay(link, member.group, group) for member in self.members]
             of_delay = np.array([delay == coupling_term.delay for delay in delays])[members]
             self.arcs[key] = _Arcs(senders[of_delay], receivers[of_delay], weights[of_delay])
         return self.arcs[key]
 
     def _all_arcs(
-        self, member_index: int, link: str, clock: str
+        self, member_index: int, link: str, route_index: int = -1
     ) -> tuple[Integers, Integers, Floats, Integers]:
         """Return senders, receivers and weights of the arcs over a link, and the senders' members.
 
-        Over an unreliable link received at a `clock`, each arc is a directed link with separate packets.
+        With the index of a route, they are those of the route, whose directed links have separate packets.
         """
-        if clock:
-            route = self.routes[self.route_of[link, clock]]
+        if route_index >= 0:
+            route = self.routes[route_index]
             arcs = np.flatnonzero(self.member_of[route.pairs[:, 1]] == member_index)
             pairs = route.pairs[arcs]
             return arcs, self.index_in[pairs[:, 1]], route.weights[arcs], self.member_of[pairs[:, 0]]

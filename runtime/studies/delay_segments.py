@@ -215,7 +215,7 @@ def borders(
     holds = dict.fromkeys(
         (hold.clock, hold.delay) for peer_type in system.peer_types for hold in peer_type.holds
     )
-    packets = dict.fromkeys((link.clock, delay) for link in system.links for delay in link.delays)
+    packets = dict.fromkeys((link.clock_at(delay), delay) for link in system.links for delay in link.delays)
     ticks = [(name, "") for name in clocks]
     event_pairs = [
         *itertools.product(holds, [*ticks, *holds]),

@@ -20,6 +20,7 @@ from apc.compiler.expression_data import POLISH, straight
 from apc.compiler.weights import arcs
 from apc.parameter_values.parameters import resolve
 
+Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 
@@ -49,16 +50,21 @@ def effort(system: Model) -> Effort:
     """
     peer_types = [system.peer_types[group.peer_type] for group in system.groups]
     counts = np.array([group.count for group in system.groups], dtype=np.int64)
+    names = np.array([group.name for group in system.groups])
     timings = resolve(system).timings
-    rates = {clock.name: 1 / float(timings[clock.period]) for clock in system.clocks}
+    rates = {clock.name: float(1 / timings[clock.period]) for clock in system.clocks}
     received: dict[str, Integers] = {}
     largest_rates, total_rates = np.zeros(len(peer_types)), np.zeros(len(peer_types))
     for link in system.links:
         channels = np.array([_channels(peer_type, link) for peer_type in peer_types], dtype=np.int64)
         receives = np.array([_receives(peer_type, link) for peer_type in peer_types])
-        received[link.name], most, total = _directed_link_counts(link, counts, channels > 0, receives)
-        largest_rates += channels * most * rates[link.clock]
-        total_rates += channels * total * rates[link.clock]
+        packets = np.full((len(counts), len(counts)), rates[link.clock])
+        for pair in (pair for pair in link.pairs if pair.clock):
+            of_pair = np.ix_(names == pair.sender, names == pair.receiver)
+            packets[of_pair] = rates[pair.clock]
+        received[link.name], most, total = _directed_link_rates(link, counts, channels > 0, receives, packets)
+        largest_rates += channels * most
+        total_rates += channels * total
     ticks = [
         (
             _operations(clock.tick)
@@ -82,13 +88,12 @@ def _receives(peer_type: PeerType, link: Link) -> bool:
     return any(receive.link == link.name for clock in peer_type.clocks for receive in clock.receives)
 
 
-def _directed_link_counts(
-    link: Link, counts: Integers, sends: NDArray[np.bool_], receives: NDArray[np.bool_]
-) -> tuple[Integers, Integers, Integers]:
-    """Return the numbers of directed links by group, as three arrays (K,).
+def _directed_link_rates(
+    link: Link, counts: Integers, sends: NDArray[np.bool_], receives: NDArray[np.bool_], rates: Floats
+) -> tuple[Integers, Floats, Floats]:
+    """Return the largest number of senders to one peer, and the packet rates in 1/s, by group (K,).
 
-    These are the largest number of senders to one peer, the largest number of receivers from one peer, and
-    the number of receivers from all peers of the group.
+    These are the largest rate from one peer to all its receivers, and the rate from all peers of the group.
 
     Parameters
     ----------
@@ -96,16 +101,20 @@ def _directed_link_counts(
         The link.
     counts, sends, receives
         (K,) by group: the number of peers, and whether they send and receive over the link.
+    rates
+        (K, K) the rate of the packets from one group to another, first the sender.
     """
     if link.graph.shape == "complete":
         received = receives * (int((sends * counts).sum()) - sends)
-        receivers = sends * (int((receives * counts).sum()) - receives)
+        receivers = sends * (rates @ (receives * counts) - rates.diagonal() * receives)
         return received, receivers, receivers * counts
     peers, starts = int(counts.sum()), np.cumsum([0, *counts[:-1]])
     group = np.repeat(np.arange(len(counts)), counts)
     pairs, _ = arcs(link.graph, peers)
     pairs = pairs[sends[group[pairs[:, 0]]] & receives[group[pairs[:, 1]]]]
-    senders, receivers = (np.bincount(pairs[:, side], minlength=peers) for side in (1, 0))
+    senders = np.bincount(pairs[:, 1], minlength=peers)
+    of_pair = rates[group[pairs[:, 0]], group[pairs[:, 1]]]
+    receivers = np.bincount(pairs[:, 0], of_pair, minlength=peers)
     return (
         np.maximum.reduceat(senders, starts),
         np.maximum.reduceat(receivers, starts),

@@ -111,7 +111,7 @@ def _frame_ticks(system: Model, parameter_ref: ParameterRef, value: Fraction) ->
     except ApcError:  # beyond the bounds of the number
         return math.inf
     used = {partition.clock for peer_type in system.peer_types for partition in peer_type.clocks}
-    used |= {link.clock for link in system.links}
+    used |= {clock for link in system.links for clock in link.clocks}
     periods = [timings[clock.period] for clock in system.clocks if clock.name in used]
     if not all(period > 0 for period in periods):
         return math.inf

@@ -34,8 +34,8 @@ class CommunicationGraph:
 
     `topology` is the topology's file; `groups` are the groups' names (parts of one group have one name and
     are consecutive), `starts` (K + 1,) the number of each group's first peer and the total; `default_delay`
-    is the timing of a link's delay, `pair_delay` that between two groups (link, sender, receiver) where it or
-    the channel differs: of timings of equal value and channel, always the same one.
+    is the timing of a link's delay, `pair_delay` that between two groups (link, sender, receiver) where it,
+    the channel or the clock differs: of timings of equal value, channel and clock, always the same one.
     """
 
     topology: str
@@ -88,7 +88,7 @@ class CommunicationGraph:
 
 
 def build_exchange(system: Model, timings: Mapping[str, Fraction]) -> CommunicationGraph:
-    """Return the communication graph of a model; delays of equal value and channel are one timing.
+    """Return the communication graph of a model; delays of equal value, channel and clock are one timing.
 
     Parameters
     ----------
@@ -125,11 +125,11 @@ def _cached_graph(
         indices.setdefault(name, []).append(index)
     pair_delay: dict[tuple[str, int, int], str] = {}
     for link in links:
-        timing_by_value = {timings[link.delay]: link.delay}
+        timing_by_value = {(timings[link.delay], ""): link.delay}
         for pair in link.pairs:
             timing = pair.delay
             if pair.channel is None:
-                timing = timing_by_value.setdefault(timings[pair.delay], pair.delay)
+                timing = timing_by_value.setdefault((timings[pair.delay], pair.clock), pair.delay)
             if timing != link.delay:
                 pairs = itertools.product(indices[pair.sender], indices[pair.receiver])
                 pair_delay |= {(link.name, sender, receiver): timing for sender, receiver in pairs}

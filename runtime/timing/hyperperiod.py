@@ -89,7 +89,7 @@ def times_in_use(
     for coupling_term, _ in (
         pair for group in reception for partition in group for receive in partition for pair in receive
     ):
-        clock = link_of[coupling_term.link].clock
+        clock = coupling_term.clock or link_of[coupling_term.link].clock
         clocks[clock] = clock_of[clock]
         delays[coupling_term.delay] = timings[coupling_term.delay]
     for name, delay in delays.items():

@@ -107,12 +107,14 @@ def reception_of(
                 check_mean(exchange, peer, receive.link, receive.operator, False, Fraction(0))
             delays = dict.fromkeys(exchange.delay(receive.link, sender, group) for sender in senders)
             edge = edge_name(partition, receive)
+            clocks = {delay: exchange.links[receive.link].own_clock(delay) for delay in delays}
             receives.append(
                 tuple(
                     (
                         CouplingTerm(
                             *(receive.operator, receive.link, delay, edge, names[c] if edge else ""),
                             before=receive.before,
+                            clock=clocks[delay],
                         ),
                         names[c],
                     )

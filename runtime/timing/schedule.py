@@ -51,11 +51,12 @@ def discrete_states_of(values: Iterable[ClockedValue], ticks: Sequence[int]) -> 
 
 @dataclass(frozen=True, slots=True, order=True)
 class SentSample:
-    """A channel of a link as sent at the link clock's tick `slot` of a frame."""
+    """A channel of a link as sent at tick `slot` of a frame, of `clock`; if empty, of the link's clock."""
 
     link: str
     channel: str
     slot: int
+    clock: str = ""
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -65,7 +66,7 @@ class CouplingTerm:
     It contains only the pairs of peers whose delay is the timing `delay`. A receive that weights each sender
     separately, by the slope of its edge function, has one coupling term per channel: `edge` and `channel`
     name it, and are empty for a plain sum or mean. With `before`, a tick receives the values of the tick
-    before.
+    before. `clock` is the pairs' own clock, whose ticks send the packets; empty for the link's.
     """
 
     operator: str
@@ -74,6 +75,11 @@ class CouplingTerm:
     edge: str = ""
     channel: str = ""
     before: bool = False
+    clock: str = ""
+
+    def sample(self, channel: str, slot: int) -> SentSample:
+        """Return the sample of a channel that a slot sends to this coupling term."""
+        return SentSample(self.link, channel, slot, self.clock)
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -227,7 +233,7 @@ def with_per_tick_inputs(schedule: Schedule) -> Schedule:
     The rows of r are those of `schedule.selected`, in order.
     """
     received = tuple(
-        ReceivedSample(row.coupling_term, SentSample(row.coupling_term.link, row.channel, 0), 0)
+        ReceivedSample(row.coupling_term, row.coupling_term.sample(row.channel, 0), 0)
         for row in schedule.selected
     )
     return replace(schedule, received=received, selected=())

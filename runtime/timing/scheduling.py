@@ -21,7 +21,7 @@ from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.wording import no_more
 from apc.linearization.linear_subsystem import LinearSubsystem
 from apc.timing.communication_graph import CommunicationGraph, build_exchange
-from apc.timing.hyperperiod import ClockGrid, Times, times_in_use
+from apc.timing.hyperperiod import Times, times_in_use
 from apc.timing.liveness import ReceptionPattern, live_holds, live_outputs, live_receives, reception_of
 from apc.timing.schedule import (
     HELD,
@@ -164,9 +164,10 @@ def _schedules(key: _ScheduleKey) -> tuple[Schedule, ...]:
             receptions[group.peer_type, group_reception] = received
             for item in (item for row in received.values() for receive in row for item in receive):
                 if isinstance(item, UncertainSample):
-                    link = item.coupling_term.link
-                    slots = times.frame // times.clocks[exchange.links[link].clock].period
-                    depth |= {SentSample(link, item.channel, k): stored[link] for k in range(slots)}
+                    term = item.coupling_term
+                    link = exchange.links[term.link]
+                    slots = times.frame // times.clocks[term.clock or link.clock].period
+                    depth |= {term.sample(item.channel, k): stored[link.name] for k in range(slots)}
                 else:
                     depth[item.sent] = max(depth.get(item.sent, 0), item.lag)
     _check_depth(system, depth)
@@ -300,12 +301,12 @@ def newest(
     rank
         The rank of each event type among coincident events.
     """
-    delay, grid = times.delays[coupling_term.delay], times.clocks[link.clock]
+    delay, grid = times.delays[coupling_term.delay], times.clocks[coupling_term.clock or link.clock]
     missed = 1 if delay == 0 and rank["deliver"] < rank["send"] else 0
     strictly = rank["tick"] < rank["deliver"] or (link.after and delay == 0)
     number = grid.newest(instant - delay, strictly=strictly) - missed
     frames, slot = divmod(number, times.frame // grid.period)  # a negative number belongs to an earlier frame
-    return ReceivedSample(coupling_term, SentSample(coupling_term.link, channel, slot), -frames)
+    return ReceivedSample(coupling_term, coupling_term.sample(channel, slot), -frames)
 
 
 def _build_schedule(
@@ -331,7 +332,7 @@ def _build_schedule(
         All times in quanta, and the rank of each event type among coincident events.
     """
     peer_type = pattern.peer_type
-    grid_of = {link.name: times.clocks.get(link.clock) for link in system.links}
+    clock_of = {link.name: link.clock for link in system.links}
     after = {link.name for link in system.links if link.after}
     receptions = {item for row in received_at.values() for receive in row for item in receive}
     received = tuple(sorted(received for received in receptions if isinstance(received, ReceivedSample)))
@@ -343,7 +344,7 @@ def _build_schedule(
     events = _sorted_events(
         [
             *_tick_events(pattern, received_at, received + selected, times, rank["tick"]),
-            *_send_events(pattern, grid_of, sent, times.frame, rank["send"], after),
+            *_send_events(pattern, clock_of, sent, times, rank["send"], after),
             *switches,
             *((mark, 0, None) for mark in sample_times),  # so that propagation stops there
         ]
@@ -366,7 +367,7 @@ def _build_schedule(
         sample_times=sample_times,
         value_names=tuple(_value_name(pattern, value, times) for value in discrete_states),
         sent_names=tuple(f"{item.channel} sent" for item in sent),
-        sent_times=tuple(_slot_time(item, grid_of) for item in sent),
+        sent_times=tuple(times.clocks[item.clock or clock_of[item.link]].at(item.slot) for item in sent),
         selected=selected,
         repeats=_repeated_events(pattern, live, events, discrete_states, ticks),
     )
@@ -420,9 +421,9 @@ def _tick_events(
 
 def _send_events(
     pattern: LinearSubsystem,
-    grid_of: Mapping[str, ClockGrid | None],
+    clock_of: Mapping[str, str],
     sent: Sequence[SentSample],
-    frame: int,
+    times: Times,
     rank: int,
     after: Collection[str],
 ) -> Iterator[_TimedEvent]:
@@ -430,28 +431,25 @@ def _send_events(
 
     Parameters
     ----------
-    pattern, grid_of
+    pattern, clock_of
         The structural pattern of the peer type, and the clock of each link.
     sent
         The samples that the peer sends and other peers receive, in the order of the rows of s.
-    frame, rank
-        The length of the frame in quanta, and the rank of send events among coincident events.
+    times, rank
+        All times in quanta, and the rank of send events among coincident events.
     after
         The links whose packets take the values after all other events at an instant.
     """
     for send_index, sending in enumerate(pattern.peer_type.sends):
-        grid = grid_of[sending.link]
-        for slot in range(frame // grid.period if grid else 0):
-            rows = tuple(
-                (sending.channels.index(item.channel), index)
-                for index, item in enumerate(sent)
-                if item.link == sending.link and item.slot == slot
-            )
-            if rows:
-                assert grid is not None
-                is_after = sending.link in after
-                rank_of_link = len(ORDER) if is_after else rank
-                yield grid.at(slot), rank_of_link, SendEvent(send_index, rows, is_after)
+        rows: dict[tuple[str, int], list[tuple[int, int]]] = {}
+        for index, item in enumerate(sent):
+            if item.link == sending.link:
+                row = sending.channels.index(item.channel), index
+                rows.setdefault((item.clock or clock_of[item.link], item.slot), []).append(row)
+        is_after = sending.link in after
+        for clock, slot in sorted(rows):
+            event = SendEvent(send_index, tuple(rows[clock, slot]), is_after)
+            yield times.clocks[clock].at(slot), len(ORDER) if is_after else rank, event
 
 
 def _hold_updates(
@@ -489,13 +487,6 @@ def _hold_updates(
             switch = HoldUpdate(hold_index, ClockedValue(p, hold.output, index - missed))
             timed_events.append((grid.at(index) + delay, rank["act"], switch))
     return active_at_start, timed_events
-
-
-def _slot_time(sent: SentSample, grid_of: Mapping[str, ClockGrid | None]) -> int:
-    """Return the instant at which a slot is sent, in quanta from the frame's start."""
-    grid = grid_of[sent.link]
-    assert grid is not None
-    return grid.at(sent.slot)
 
 
 def _discrete_states(

@@ -83,6 +83,8 @@ def refuse_unheld(system: Model, reception: PerTickReception) -> None:
     rows = [row for group_rows in reception.rows.values() for row in group_rows]
     clocks = {clock.name: clock for clock in system.clocks}
     for link in system.links:
+        if len(link.clocks) > 1:
+            raise NotSupportedError(f"pairs of groups of {link.name} have different clocks")
         for channel in link.channels:
             if channel.trace is not None:
                 raise NotSupportedError(f"{link.name} has a trace")

@@ -64,6 +64,8 @@ class Packets:
     """
 
     def __init__(self, system: Model, reception: PerTickReception) -> None:
+        if several := [link.name for link in system.links if len(link.clocks) > 1]:
+            raise NotSupportedError(f"pairs of groups of {several[0]} have different clocks")
         self.reception = reception
         self.rows = dict.fromkeys(row for rows in reception.rows.values() for row in rows)
         self.links = {link.name: link for link in system.links}

@@ -569,7 +569,7 @@ def _periods(system: Model, subsystems: Sequence[PeerClass]) -> tuple[Fraction, 
     ]
     coupling_terms = [received.coupling_term for group in subsystems for received in group.schedule.received]
     forces = dict.fromkeys(hold.clock for hold in holds)
-    networks = dict.fromkeys(link_clock[coupling_term.link] for coupling_term in coupling_terms)
+    networks = dict.fromkeys(term.clock or link_clock[term.link] for term in coupling_terms)
     missing = [
         text
         for group in {subsystem.index: subsystem for subsystem in subsystems}.values()

@@ -1,0 +1,222 @@
+"""A clock of the packets between two groups: against two links, and event by event by hand."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.linalg import expm
+from scipy.optimize import linear_sum_assignment
+
+import apc
+from apc.compiler.compiled import Model
+from apc.compiler.errors import ApcError
+from tests.topologies import compiled, replaced
+
+Floats = NDArray[np.float64]
+MS = Fraction(1, 1000)
+FAST, SLOW = Fraction(1, 125), Fraction(1, 60)
+
+
+def topology(
+    coupler: str = "AveragePosition",
+    stiffness: float = 200,
+    users: int = 3,
+    link: str = "",
+    slow: str = "60 Hz",
+) -> str:
+    """Return users who send at 125 Hz and one who sends at another rate, over one link."""
+    pairs = link or "pairs: {mobile: {user: {clock: slow}}}"
+    return f"""\
+topology: rates
+clocks: {{haptic: 1 ms, fast: 125 Hz, slow: {slow}}}
+peers: {{user: {{count: {users}}}, mobile: {{count: 1}}}}
+masses:
+  device: {{mass: 0.1 kg, damping: 5 N*s/m}}
+  cube:   {{mass: 0.6 kg, damping: 5 N*s/m, shared: true}}
+couplers:
+  contact: {{type: SampledSpringDamper, a: device, b: cube, stiffness: 1000 N/m, clock: haptic, delay: 1 ms}}
+  pull: {{type: {coupler}, object: cube, stiffness: {stiffness} N/m, clock: haptic, delay: 1 ms, link: lan}}
+links:
+  lan: {{clock: fast, delay: 8 ms, {pairs}}}
+"""
+
+
+@dataclass(frozen=True)
+class Clock:
+    """The times at which a peer sends, and the delay of its packets, in seconds."""
+
+    period: Fraction
+    phase: Fraction = Fraction(0)
+    delay: Fraction = 8 * MS
+
+    @property
+    def stored(self) -> int:
+        """The number of packets that are stored between sending and arrival."""
+        return math.ceil(self.delay / self.period) + 1
+
+
+@dataclass(frozen=True)
+class ByHand:
+    """Peers in a complete graph, all with equal numbers; peer k sends at the ticks of `clocks[k]`.
+
+    The state has (x, v, x_O, v_O) of each peer, its two acting and its two computed forces, and for each
+    directed link the sample in effect and the last packets, newest first, as (x_O, v_O).
+    """
+
+    clocks: tuple[Clock, ...]
+    stiffness: float
+    mean: bool = True
+
+    @property
+    def peers(self) -> int:
+        return len(self.clocks)
+
+    @property
+    def arcs(self) -> list[tuple[int, int]]:
+        return [(j, i) for i in range(self.peers) for j in range(self.peers) if i != j]
+
+    def rows(self, arc: tuple[int, int]) -> slice:
+        """Return the rows of a directed link: the sample in effect, then its packets."""
+        first = 8 * self.peers
+        for other in self.arcs:
+            length = 2 * (1 + self.clocks[other[0]].stored)
+            if other == arc:
+                return slice(first, first + length)
+            first += length
+        raise AssertionError(arc)
+
+    @property
+    def size(self) -> int:
+        return self.rows(self.arcs[-1]).stop
+
+    def coast(self, duration: Fraction) -> Floats:
+        """Return the map of all motions under the acting forces."""
+        whole, t = np.eye(self.size), float(duration)
+        for i in range(self.peers):
+            for first, mass, forces in ((0, 0.1, {0: -1.0}), (2, 0.6 / self.peers, {0: 1.0, 1: -1.0})):
+                rate = np.zeros((4, 4))  # of x, v and two forces
+                rate[0, 1], rate[1, 1] = 1.0, -5.0 / mass
+                for force, sign in forces.items():
+                    rate[1, 2 + force] = sign / mass
+                step, at = expm(rate * t), 8 * i + first
+                whole[at : at + 2, at : at + 2] = step[:2, :2]
+                whole[at : at + 2, 8 * i + 4 : 8 * i + 6] = step[:2, 2:]
+        return whole
+
+    def tick(self) -> Floats:
+        """Return the map of a haptic tick: the forces of the last tick act, and new ones are computed."""
+        whole = np.eye(self.size)
+        for i in range(self.peers):
+            at = 8 * i
+            whole[at + 4 : at + 8] = 0.0
+            whole[at + 4, at + 6] = whole[at + 5, at + 7] = 1.0
+            whole[at + 6, at], whole[at + 6, at + 2] = 1000.0, -1000.0
+            others = self.peers - 1
+            whole[at + 7, at + 2] = self.stiffness * (1 if self.mean else others)
+            for j in range(self.peers):
+                if j != i:
+                    whole[at + 7, self.rows((j, i)).start] = -self.stiffness / (others if self.mean else 1)
+        return whole
+
+    def send(self, arc: tuple[int, int]) -> Floats:
+        whole, rows = np.eye(self.size), self.rows(arc)
+        whole[rows.start + 2 : rows.stop] = np.eye(self.size)[rows.start : rows.stop - 2]
+        whole[rows.start + 2 : rows.start + 4] = np.eye(self.size)[8 * arc[0] + 2 : 8 * arc[0] + 4]
+        return whole
+
+    def arrive(self, arc: tuple[int, int], age: int) -> Floats:
+        """Return the map of an arrival: of the packet that `age` others followed."""
+        whole, first = np.eye(self.size), self.rows(arc).start
+        whole[first : first + 2] = np.eye(self.size)[first + 2 * age + 2 : first + 2 * age + 4]
+        return whole
+
+    def events(self, frame: Fraction) -> list[tuple[str, Floats]]:
+        """Return the maps of a frame's events in order, each with its kind."""
+        found: list[tuple[Fraction, int, str, Floats]] = []
+        for k in range(int(frame / MS)):
+            found.append((k * MS, 2, "tick", self.tick()))
+        for arc in self.arcs:
+            clock = self.clocks[arc[0]]
+            for k in range(-clock.stored, int(frame / clock.period)):
+                sent = clock.phase + k * clock.period
+                arrival = sent + clock.delay
+                if 0 <= sent < frame:
+                    found.append((sent, 1, "send", self.send(arc)))
+                if 0 <= arrival < frame:  # before the packets of its instant are sent
+                    age = sum(sent + n * clock.period < arrival for n in range(1, clock.stored + 1))
+                    found.append((arrival, 0, "arrive", self.arrive(arc, age)))
+            in_time = [one for one in found if one[2] == "arrive" and one[0] < 0]
+            assert not in_time
+        found.sort(key=lambda one: one[:2])
+        result = []
+        for (now, _, kind, step), following in zip(
+            found, [*(one[0] for one in found[1:]), frame], strict=True
+        ):
+            result.append((kind, step))
+            if following > now:
+                result.append(("coast", self.coast(following - now)))
+        return result
+
+    def frame(self, length: Fraction) -> Floats:
+        whole = np.eye(self.size)
+        for _, step in self.events(length):
+            whole = step @ whole
+        return whole
+
+
+def poles(values: NDArray[np.complex128]) -> NDArray[np.complex128]:
+    """Return the eigenvalues that are neither 0 nor that of the common translation."""
+    return values[(np.abs(values) > 1e-6) & (np.abs(values - 1) > 1e-9)]
+
+
+def found_poles(system: Model) -> NDArray[np.complex128]:
+    modes = apc.analyze(system).modes
+    return poles(np.array([one.eigenvalue for one in modes for _ in range(one.multiplicity)]))
+
+
+def distance(one: NDArray[np.complex128], other: NDArray[np.complex128]) -> float:
+    """Return the largest difference between eigenvalues, each with a partner of its own."""
+    between = np.abs(one[:, None] - other)
+    assert between.shape[0] == between.shape[1] > 0
+    return float(between[linear_sum_assignment(between)].max())
+
+
+TWO_LINKS = (
+    replaced(
+        topology("FullMesh", 60),
+        (
+            "  pull:",
+            "  slower: {type: FullMesh, object: cube, stiffness: 60 N/m, clock: haptic, delay: 1 ms, link: wan}\n  pull:",
+        ),
+        ("pairs: {mobile: {user: {clock: slow}}}", "graph: {arcs: [[user, user], [user, mobile]]}"),
+    )
+    + "  wan: {clock: slow, delay: 8 ms, graph: {arcs: [[mobile, user]]}}\n"
+)
+
+
+def test_a_clock_of_pairs_replaces_a_second_link() -> None:
+    one, two = compiled(topology("FullMesh", 60)), compiled(TWO_LINKS)
+    assert apc.analyze(one).spectral_radius == pytest.approx(apc.analyze(two).spectral_radius, rel=1e-12)
+    assert distance(found_poles(one), found_poles(two)) < 1e-12
+
+
+SLOWER = {
+    "60 Hz": Clock(SLOW),
+    "{period: 16 ms, phase: 3 ms}": Clock(16 * MS, 3 * MS),
+    "{period: 5 ms, phase: 1 ms}": Clock(5 * MS, MS),
+}
+
+
+@pytest.mark.parametrize("slow", SLOWER)
+@pytest.mark.parametrize("coupler", ["AveragePosition", "FullMesh"])
+def test_the_poles_are_those_of_the_events_by_hand(coupler: str, slow: str) -> None:
+    system = compiled(topology(coupler, 120, slow=slow))
+    hand = ByHand((*[Clock(FAST)] * 3, SLOWER[slow]), 120, coupler == "AveragePosition")
+    frame = hand.frame(Fraction(apc.analyze(system).frame_s).limit_denominator(1000))
+    assert distance(found_poles(system), poles(np.linalg.eigvals(frame))) < 1e-9
