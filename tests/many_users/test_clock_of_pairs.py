@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from fractions import Fraction
 
@@ -15,7 +14,6 @@ from scipy.optimize import linear_sum_assignment
 
 import apc
 from apc.compiler.compiled import Model
-from apc.compiler.errors import ApcError
 from tests.topologies import compiled, replaced
 
 Floats = NDArray[np.float64]
@@ -136,36 +134,31 @@ class ByHand:
         whole[first : first + 2] = np.eye(self.size)[first + 2 * age + 2 : first + 2 * age + 4]
         return whole
 
-    def events(self, frame: Fraction) -> list[tuple[str, Floats]]:
-        """Return the maps of a frame's events in order, each with its kind."""
-        found: list[tuple[Fraction, int, str, Floats]] = []
-        for k in range(int(frame / MS)):
-            found.append((k * MS, 2, "tick", self.tick()))
+    def events(self, frame: Fraction) -> list[tuple[str, Floats, tuple[int, int]]]:
+        """Return the maps of a frame's events in order, each with its kind and its directed link."""
+        none = (-1, -1)
+        found = [(k * MS, 2, "tick", self.tick(), none) for k in range(int(frame / MS))]
         for arc in self.arcs:
             clock = self.clocks[arc[0]]
             for k in range(-clock.stored, int(frame / clock.period)):
                 sent = clock.phase + k * clock.period
                 arrival = sent + clock.delay
                 if 0 <= sent < frame:
-                    found.append((sent, 1, "send", self.send(arc)))
+                    found.append((sent, 1, "send", self.send(arc), arc))
                 if 0 <= arrival < frame:  # before the packets of its instant are sent
                     age = sum(sent + n * clock.period < arrival for n in range(1, clock.stored + 1))
-                    found.append((arrival, 0, "arrive", self.arrive(arc, age)))
-            in_time = [one for one in found if one[2] == "arrive" and one[0] < 0]
-            assert not in_time
+                    found.append((arrival, 0, "arrive", self.arrive(arc, age), arc))
         found.sort(key=lambda one: one[:2])
         result = []
-        for (now, _, kind, step), following in zip(
-            found, [*(one[0] for one in found[1:]), frame], strict=True
-        ):
-            result.append((kind, step))
+        for (now, _, *event), following in zip(found, [*(one[0] for one in found[1:]), frame], strict=True):
+            result.append((*event,))
             if following > now:
-                result.append(("coast", self.coast(following - now)))
+                result.append(("coast", self.coast(following - now), none))
         return result
 
     def frame(self, length: Fraction) -> Floats:
         whole = np.eye(self.size)
-        for _, step in self.events(length):
+        for _, step, _ in self.events(length):
             whole = step @ whole
         return whole
 
@@ -192,7 +185,8 @@ TWO_LINKS = (
         topology("FullMesh", 60),
         (
             "  pull:",
-            "  slower: {type: FullMesh, object: cube, stiffness: 60 N/m, clock: haptic, delay: 1 ms, link: wan}\n  pull:",
+            "  slower: {type: FullMesh, object: cube, stiffness: 60 N/m, clock: haptic, delay: 1 ms, "
+            "link: wan}\n  pull:",
         ),
         ("pairs: {mobile: {user: {clock: slow}}}", "graph: {arcs: [[user, user], [user, mobile]]}"),
     )
@@ -220,3 +214,79 @@ def test_the_poles_are_those_of_the_events_by_hand(coupler: str, slow: str) -> N
     hand = ByHand((*[Clock(FAST)] * 3, SLOWER[slow]), 120, coupler == "AveragePosition")
     frame = hand.frame(Fraction(apc.analyze(system).frame_s).limit_denominator(1000))
     assert distance(found_poles(system), poles(np.linalg.eigvals(frame))) < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("coupler", "loss", "jit"),
+    [
+        ("AveragePosition", "", False),
+        ("FullMesh", "", False),
+        ("FullMesh", "loss: 1.0e-9, ", False),  # over an unreliable link
+        ("AveragePosition", "loss: 1.0e-9, ", False),
+        ("AveragePosition", "loss: 1.0e-9, ", True),
+    ],
+)
+def test_a_simulation_is_the_events_by_hand(coupler: str, loss: str, jit: bool) -> None:
+    pairs = f"{loss}pairs: {{mobile: {{user: {{clock: slow}}}}}}"
+    system = compiled(topology(coupler, 120, link=pairs))
+    found = apc.simulate(system, duration="0.4 s", params={"mobile.device.v": 1.0}, jit=jit)
+    hand = ByHand((*[Clock(FAST)] * 3, Clock(SLOW)), 120, coupler == "AveragePosition")
+    start = np.eye(hand.size)[8 * 3 + 1]
+    state = np.linalg.matrix_power(hand.frame(Fraction(1, 5)), 2) @ start
+    ends = {signal.name: value for signal, value in zip(found.signals, found.values[-1], strict=True)}
+    for peer, at in (("user[2]", 8), ("mobile[1]", 24)):
+        assert ends[f"{peer}.cube.x"] == pytest.approx(state[at + 2], rel=1e-11)
+
+
+# The lossy link has one name in both: its packets get lost alike.
+QUICK = {"slow": "{period: 16 ms, phase: 3 ms}"}
+LOSSY = topology("FullMesh", 60, link="pairs: {mobile: {user: {clock: slow, loss: 30 %}}}", **QUICK)
+LOSSY_LINK = replaced(
+    TWO_LINKS,
+    ("slow: 60 Hz", "slow: {period: 16 ms, phase: 3 ms}"),
+    ("wan: {clock: slow,", "lan: {clock: slow, loss: 30 %,"),
+    ("lan: {clock: fast", "other: {clock: fast"),
+    ("1 ms, link: lan}\n", "1 ms, link: other}\n"),
+    ("link: wan", "link: lan"),
+)
+
+
+def test_lost_packets_of_the_pairs_are_those_of_a_second_link() -> None:
+    reliable = topology("FullMesh", 60, **QUICK)
+    one, two, none = (
+        apc.simulate(
+            compiled(text), duration="0.4 s", params={"mobile.device.v": 1.0}, signals=["*.x"], jit=False
+        )
+        for text in (LOSSY, LOSSY_LINK, reliable)
+    )
+    assert np.abs(one.values - two.values).max() < 1e-14
+    assert np.abs(one.values - none.values).max() > 1e-5
+
+
+def growth(system: Model) -> float:
+    found = apc.mean_square_stability(system)
+    assert found is not None and found.exact and found.mean_square_radius is not None, found
+    return found.mean_square_radius
+
+
+def test_second_moments_are_those_of_a_second_link() -> None:
+    assert growth(compiled(LOSSY)) == pytest.approx(growth(compiled(LOSSY_LINK)), rel=1e-9)
+
+
+@pytest.mark.parametrize("slow", ["{period: 16 ms, phase: 3 ms}", "{period: 4 ms, phase: 1 ms}"])
+def test_second_moments_are_those_of_the_events_by_hand(slow: str) -> None:
+    """At a stiffness where they grow: the expectation of M ⊗ M is a product over the events of a frame."""
+    clock = Clock(16 * MS, 3 * MS) if "16" in slow else Clock(4 * MS, MS)
+    pairs = "loss: 20 %, pairs: {mobile: {user: {clock: slow, loss: 40 %}}}"
+    system = compiled(topology("AveragePosition", 2500, users=1, link=pairs, slow=slow))
+    hand = ByHand((Clock(FAST), clock), 2500)
+    operator = np.eye(hand.size**2)
+    for kind, step, arc in hand.events(16 * MS if "16" in slow else 8 * MS):
+        after = np.kron(step, step)
+        if kind == "arrive":
+            loss = 0.2 if arc == (0, 1) else 0.4
+            after = (1 - loss) * after + loss * np.eye(hand.size**2)
+        operator = after @ operator
+    moments = float(np.abs(np.linalg.eigvals(operator)).max())
+    assert moments > 1.01
+    assert growth(system) == pytest.approx(moments, rel=1e-8)
