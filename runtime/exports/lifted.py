@@ -555,7 +555,8 @@ def _received_ports(received: Sequence[ReceivedSample], link: str, units: Mappin
     several = any(subject.sent.slot for subject in received)
     named = [
         f"{subject.coupling_term.operator} "
-        f"{subject.sent.channel}{f' #{subject.sent.slot + 1}' * several}({-subject.lag})"
+        f"{subject.sent.channel}{f' #{subject.sent.slot + 1}' * several}"
+        f"{f' at {subject.sent.clock}' * bool(subject.sent.clock)}({-subject.lag})"
         for subject in received
     ]
     pairs = zip(named, received, strict=True)

@@ -366,7 +366,7 @@ def _build_schedule(
         ticks=ticks,
         sample_times=sample_times,
         value_names=tuple(_value_name(pattern, value, times) for value in discrete_states),
-        sent_names=tuple(f"{item.channel} sent" for item in sent),
+        sent_names=tuple(f"{item.channel} sent{f' at {item.clock}' * bool(item.clock)}" for item in sent),
         sent_times=tuple(times.clocks[item.clock or clock_of[item.link]].at(item.slot) for item in sent),
         selected=selected,
         repeats=_repeated_events(pattern, live, events, discrete_states, ticks),

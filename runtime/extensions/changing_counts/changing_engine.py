@@ -28,7 +28,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from apc.extensions.changing_counts.peer_times import counts_of, model_of_present
+from apc.extensions.changing_counts.peer_times import counts_of, model_of_present, packets_fault
 from apc.network.packet_schedule import START, DeliveredPackets, Timetable
 from apc.simulation.compiled_engine import CompiledEngine
 from apc.simulation.interpreted_engine import InterpretedEngine
@@ -120,9 +120,10 @@ class ChangingEngine:
             self.presence.joins[route.pairs].max(axis=1) // simulation.frame * route.slots * (not deliveries)
             for route in self.routes
         )
+        for frame in (0, *self.changes):  # errors of all numbers of peers are found before the first row
+            if _packets(self._simulation(self._present_in(frame))) != _packets(simulation):
+                raise packets_fault(simulation.topology, frame * simulation.frame * simulation.quantum)
         self.begin(0)
-        for frame in self.changes:  # errors of all numbers of peers are found before the first row
-            self._simulation(self._present_in(frame))
 
     def begin(self, run: int) -> None:
         """Reset all peers to time 0 of a run (see `population.FrameEngine`)."""
@@ -220,6 +221,13 @@ class ChangingEngine:
         for route, (held, effective) in enumerate(received):
             new.engine.held[route][:], new.engine.effective[route][:] = held, effective
         self.now = new
+
+
+def _packets(simulation: Simulation) -> tuple[object, ...]:
+    """Return the packets of a frame, which must not depend on the present peers."""
+    program = simulation.population.exchange_program
+    routes = [(route.link, route.clock, route.sent_by) for route in program.routes]
+    return simulation.frame * simulation.quantum, program.ring, program.keys, routes
 
 
 def _changed(old: PresentPeers, new: PresentPeers, frame: int) -> tuple[list[Floats], Floats]:

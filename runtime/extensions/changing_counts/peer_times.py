@@ -2,7 +2,7 @@
 
 Takes: texts of options; the joins and leaves of a model's experiment.
 Gives: `with_peer_times`, `presence_of`, `counts_of`, `model_of_present`,
-`model_at_end`.
+`model_at_end`, `packets_fault`.
 Guarantees: all invalid instants are reported together (E914). Peers join and leave at the starts of frames.
 Does not: simulate (see `changing_engine`).
 """
@@ -193,10 +193,21 @@ def _check_counts(system: Model, present: Flags, at: Fraction) -> None:
     for group, count in zip(system.groups, counts, strict=True):
         least = max(1, least_peers(system.peer_types) - sum(counts) + count)
         if count < least:
-            items = [(key, item) for key in ("joins", "leaves") for item in getattr(system.experiment, key)]
-            key, item = next((pair for pair in reversed(items) if pair[1].at == at), items[0])
             subject = f"peers of {group.name} from {_s(at)} on"
-            raise _fault(system, key, item, subject, f"at least {least}", str(count))
+            raise _fault(system, *_change_at(system, at), subject, f"at least {least}", str(count))
+
+
+def _change_at(system: Model, at: Fraction) -> tuple[str, PeerTime]:
+    """Return the key and the entry of the last join or leave at an instant, by default of the first one."""
+    items = [(key, item) for key in ("joins", "leaves") for item in getattr(system.experiment, key)]
+    return next((pair for pair in reversed(items) if pair[1].at == at), items[0])
+
+
+def packets_fault(system: Model, at: Fraction) -> ApcError:
+    """Return the error E914 of a change after which no packets have some delay or clock of the links."""
+    subject, expected = f"packets from {_s(at)} on", "all delays and clocks of the links in use"
+    advice = "keep at least two peers of each group"
+    return _fault(system, *_change_at(system, at), subject, expected, "fewer", advice=advice)
 
 
 def counts_of(system: Model, present: Flags) -> list[int]:
