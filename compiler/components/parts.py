@@ -1,8 +1,8 @@
 """The entries of parts, in a topology or inside a component, checked against their components.
 
 Takes: YAML mappings, the components, and the enclosing scope. Gives: `PartEntry`, `PartEntries`,
-`EntryScope`; `read_entry`, the `PartBindings` of an entry; `read_option`; `Definitions`, `component_named`,
-`joining_of`.
+`EntryScope`; `read_entry`, the `PartBindings` of an entry; `read_option`, `read_reference`; `Definitions`,
+`component_named`, `joining_of`.
 Guarantees: every number, option, reference and connection required by a component exists, or one error
 reports that it is missing.
 Does not: handle the sections of a topology.

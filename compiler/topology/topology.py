@@ -334,8 +334,6 @@ class _Names:
             other = next((name for name in reversed(self.groups) if name != group), group)
             example = f"{link}: {{pairs: {{{group}: {{{other}: {{{parameter}: {value}}}}}}}}}"
             advice = f"set it in links, as in {example}" if parameter in PAIR else ""
-            if parameter == "clock":
-                advice = f"define a link with this clock and graph: {{arcs: [[{group}, {other}]]}}"
             message = f"{name} belongs to a link and can't be set by a group"
             raise fault("E211", location, message, advice=advice)
         if self.is_reported(name):

@@ -57,7 +57,8 @@ couplers:
   contact: {type: SampledSpringDamper, a: device, b: "chain[3].flange", stiffness: kt/peers, clock: late}
 links:
   lan: {clock: late, delay: 0 s, graph: ring, delays: {left: {right: 12 ms}},
-    pairs: {right: {left: {delay: 3 ms, loss: {p: 1 %}, jitter: 1 ms, distribution: normal, on_loss: zero}}}}
+    pairs: {right: {left: {delay: 3 ms, loss: {p: 1 %}, jitter: 1 ms, distribution: normal, on_loss: zero,
+      clock: haptic}}}}
   wan: {clock: late, graph: {edges: [[1, 2], ["left[1]", 3, 0.5]]}}
 hands:
   hand: {type: ConstantForce, flange: device.flange, force: -4 N, at: [left]}
@@ -138,7 +139,7 @@ def test_all_that_the_language_has_fits() -> None:
         ("link: lan}", "link: lan, delays: some}", "couplers/coordination/delays"),
         ("delay: 8 ms}", "delay: 8 ms, graph: circle}", "links/lan/graph"),
         ("delay: 8 ms}", "delay: 8 ms, count: 2}", "links/lan"),
-        ("delay: 8 ms}", "delay: 8 ms, pairs: {user: {user: {clock: haptic}}}}", "links/lan/pairs/user/user"),
+        ("delay: 8 ms}", "delay: 8 ms, pairs: {user: {user: {graph: ring}}}}", "links/lan/pairs/user/user"),
         ("[0 N/m, 5000 N/m]", "[0 N/m]", "studies/region/x/contact.stiffness"),
         ("links:", "link:", ""),
     ],

@@ -25,7 +25,7 @@ KEPT = {
     "observer": [(4, 2, 2)],
     "planar-users": [(8, 4, 4)],  # the paper's, along either axis
     "ring-of-eight": [(4, 2, 2)],
-    "sixty-hertz-user": [(4, 3, 4)],  # two forces of coordination, a packet over each link
+    "sixty-hertz-user": [(4, 2, 4)],  # a packet at each of the two clocks
     "star-lecture": [(4, 2, 4)],  # 20 ms are two frames
     "template": [(4, 2, 2)],
     "three-users-average": [(4, 2, 2)],

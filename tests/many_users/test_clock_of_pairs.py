@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import dataclass
 from fractions import Fraction
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,7 +15,10 @@ from scipy.linalg import expm
 from scipy.optimize import linear_sum_assignment
 
 import apc
+from apc.__main__ import run
 from apc.compiler.compiled import Model
+from apc.compiler.errors import ApcError
+from apc.studies.effort import effort
 from tests.topologies import compiled, replaced
 
 Floats = NDArray[np.float64]
@@ -290,3 +295,128 @@ def test_second_moments_are_those_of_the_events_by_hand(slow: str) -> None:
     moments = float(np.abs(np.linalg.eigvals(operator)).max())
     assert moments > 1.01
     assert growth(system) == pytest.approx(moments, rel=1e-8)
+
+
+def saturated(text: str) -> str:
+    """Return the same with a coupling that is evaluated for each pair of peers."""
+    coupling = "SaturatedMesh, object: cube, stiffness: 200 N/m, limit: 0.05 N"
+    return text.replace("FullMesh, object: cube, stiffness: 60 N/m", coupling)
+
+
+def test_couplings_of_each_pair_receive_at_both_clocks() -> None:
+    """The links without and with routes of packets, and two links."""
+    start = {"mobile.device.v": 1.0}
+    one = topology("FullMesh", 60, **QUICK)
+    rarely_lost = replaced(one, ("delay: 8 ms, pairs", "delay: 8 ms, loss: 1.0e-9, pairs"))
+    two = replaced(TWO_LINKS, ("slow: 60 Hz", "slow: {period: 16 ms, phase: 3 ms}"))
+    one_values, *others = (
+        apc.simulate(
+            compiled(saturated(text)), duration="0.16 s", params=start, signals=["*.x"], jit=False
+        ).values
+        for text in (one, rarely_lost, two)
+    )
+    assert np.abs(one_values).max() > 1e-3
+    assert all(np.abs(one_values - other).max() < 1e-15 for other in others)
+
+
+def test_the_age_of_samples_is_analyzed_if_all_packets_of_a_peer_have_one_clock() -> None:
+    dead_reckoning = ("FullMesh, object", "DeadReckoning, threshold: 0 m, object")
+    one = replaced(topology("FullMesh", 60, users=1, **QUICK), dead_reckoning)
+    with pytest.raises(
+        ApcError, match="E811 the age of samples received by user and mobile over lan differs"
+    ):
+        apc.analyze(compiled(one))
+    both = replaced(one, ("{clock: slow}}", "{clock: slow}}, user: {mobile: {clock: slow}}"))
+    slow = replaced(both, ("{clock: fast", "{clock: slow"))
+    pairs, link = (apc.analyze(compiled(text)).spectral_radius for text in (both, slow))
+    assert pairs == pytest.approx(link, rel=1e-12)
+
+
+def test_the_clock_of_the_link_is_no_other_clock() -> None:
+    system = compiled(topology(link="pairs: {mobile: {user: {clock: fast}}}"))
+    assert system.links[0].clocks == ("fast",) and {clock.name for clock in system.clocks} == {
+        "haptic",
+        "fast",
+    }
+
+
+def test_a_period_of_pairs_is_varied_as_that_of_a_clock() -> None:
+    system = compiled(topology("FullMesh", 120, **QUICK))
+    found = apc.sweep(system, {"slow.period": ["8 ms", "40 ms"]}, jobs=1).column("spectral_radius")
+    written = topology("FullMesh", 120, slow="{period: 40 ms, phase: 3 ms}")
+    assert found[1] == pytest.approx(apc.analyze(compiled(written)).spectral_radius, rel=1e-12)
+    assert "18 values" in str(apc.critical(system, "slow.period"))  # periods with short frames
+
+
+def test_numbers_sent_per_second_are_those_of_both_clocks() -> None:
+    """Three users send two values to three others, 125 times per second; the fourth sends at 60 Hz."""
+    cost = effort(compiled(topology("FullMesh", 60)))
+    assert cost.sent == 125 * 3 * 2 and cost.sent_by_all == 3 * cost.sent + 60 * 3 * 2
+
+
+def test_what_requires_one_clock_of_a_link_refuses_others_by_name(tmp_path: Path) -> None:
+    system = compiled(topology("FullMesh", 60, **QUICK))
+    for suffix, code, peer in (("c", "E960", "user[1]"), ("fmu", "E960", ""), ("mo", "E955", "")):
+        with pytest.raises(ApcError, match=rf"{code} .*pairs of groups of lan"):
+            apc.export(system, out=tmp_path / f"out.{suffix}", peer=peer)
+    with pytest.raises(ApcError, match=r"E861 .*one network clock \(got fast and slow\)"):
+        apc.analyze(system, method="paper")
+
+
+@pytest.mark.needs_extension("loss_models")
+def test_bursts_at_two_clocks_are_not_judged() -> None:
+    text = replaced(
+        topology("FullMesh", 60, users=1, **QUICK), ("8 ms, pairs", "8 ms, loss: {p: 1 %, r: 30 %}, pairs")
+    )
+    found = apc.mean_square_stability(compiled(text))
+    assert found is not None and found.stable is None
+    assert "pairs of groups of lan have different clocks" in str(found)
+    lossy = apc.mean_square_stability(compiled(LOSSY))
+    assert lossy is not None and lossy.losses_in_a_row is not None
+
+
+@pytest.mark.needs_extension("changing_counts")
+def test_a_change_after_which_no_packets_have_the_clock_is_refused() -> None:
+    keys = "pairs: {user: {user: {clock: slow}}}"
+    system = compiled(topology("FullMesh", 60, users=2, link=keys, **QUICK))
+    with pytest.raises(ApcError, match=r"E914 packets from 0\.016 s on: expected all delays and clocks"):
+        apc.simulate(system, duration="0.1 s", leaves={"user[1]": "16 ms"}, jit=False)
+
+
+@pytest.mark.needs_extension("changing_counts")
+@pytest.mark.parametrize("loss", ["", "loss: 30 %, "])
+def test_peers_that_join_and_leave_receive_at_both_clocks(loss: str) -> None:
+    """Two clocks with the same ticks are one clock."""
+    keys = f"{loss}pairs: {{mobile: {{user: {{clock: slow}}}}}}"
+    values, others = (
+        apc.simulate(
+            compiled(topology("FullMesh", 60, link=text, slow="8 ms")),
+            duration="0.16 s",
+            params={"mobile.device.v": 1.0},
+            signals=["*.x"],
+            joins={"user[2]": "48 ms"},
+            leaves={"user[3]": "96 ms"},
+            jit=False,
+        ).values
+        for text in (keys, keys.replace("slow", "fast"))
+    )
+    assert np.nanmax(np.abs(values)) > 1e-3 and np.nanmax(np.abs(values - others)) < 1e-15
+
+
+@pytest.mark.whole
+def test_a_run_in_real_time_does_what_is_simulated(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("apc.realtime.start.claim", tuple)
+    text = replaced(
+        topology("AveragePosition", 5, users=2, link="loss: 10 %, pairs: {mobile: {user: {clock: slow}}}"),
+        ("1 ms, fast: 125 Hz, slow: 60 Hz", "10 ms, fast: 20 ms, slow: 50 ms"),
+        ("1000 N/m", "10 N/m"),
+        ("shared: true", "shared: true, v: 0.1 m/s"),
+    )
+    Path("rates.yaml").write_text(text, encoding="utf-8")
+    assert run(["run", "--duration", "1 s", "--emulate", "--json"]) == 0
+    reported = json.loads(capsys.readouterr().out)
+    assert reported["why_not"] == "" and reported["differences"]["N"][1] > 1e-3
+    assert max(far for far, _ in reported["differences"].values()) <= 1e-9

@@ -207,17 +207,10 @@ def test_a_pair_and_a_graph_of_groups_follow_the_counts() -> None:
     )
 
 
-def test_a_slower_sender_at_the_rate_of_the_others_is_one_mesh() -> None:
-    """Two links, one for each rate, are one link if the rates and delays are equal."""
+def test_a_slower_sender_at_the_rate_of_the_others_is_one_of_them() -> None:
+    """A clock of a pair has no effect if the rates are equal."""
     text = (TOPOLOGIES / "sixty-hertz-user.yaml").read_text(encoding="utf-8")
-    second = next(line for line in text.splitlines(keepends=True) if "from_slow" in line)
-    one = replaced(
-        text,
-        (second, ""),
-        ("  slow: 60 Hz\n", ""),
-        ("graph: {arcs: [[user, user], [user, mobile]]}", "graph: complete"),
-    )
-    one = one[: one.index("  slow_lan")]
+    one = replaced(text, ("  slow: 60 Hz\n", ""), (", pairs: {mobile: {user: {clock: slow}}}", ""))
     equal = apc.set_parameters(compiled(text), {"slow.period": "8 ms"})
     assert distance(equal, compiled(one)) < 1e-10
     slower = apc.analyze(compiled(text))
