@@ -1,8 +1,8 @@
 """Numbers of peers and of senders to each peer, computed from the counts of groups.
 
 Takes: groups, peer types, links and counts of a compiled model.
-Gives: `with_received`, `received_sums`, `refuse_equal_sums`; `graph_of_groups`; `recounted`, `least_peers`,
-`peers_of`.
+Gives: `with_received`, `received_sums`, `refuse_equal_sums`; `graph_of_groups`; `clocks_in_use`; `recounted`,
+`least_peers`, `peers_of`.
 Guarantees: a model with changed counts equals the compiled topology with these counts.
 Does not: change the count of a group with different peers, or of peers named by a graph: E626.
 """
@@ -36,7 +36,7 @@ from apc.compiler.compiled import (
 )
 from apc.compiler.errors import Mistakes, SourceLocation
 from apc.compiler.source.reading import fault
-from apc.compiler.weights import arcs_of_groups, sum_weights
+from apc.compiler.weights import arcs, arcs_of_groups, sum_weights
 
 COUNT_ABOUT = "peers received over the link, counted with their weights"
 
@@ -115,6 +115,24 @@ def graph_of_groups(
         expected = f"at most {MOST_GROUP_ARCS:,} arcs"
         raise fault(code, location, "graph", expected, f"{total:,}", advice="use graph: complete")
     return Graph("arcs", *arcs_of_groups(entries, counts), tuple(entries))
+
+
+def clocks_in_use(system: Model) -> frozenset[str]:
+    """Return the clocks of all peer types, and those whose ticks send packets from some group to another."""
+    used = {part.clock for peer_type in system.peer_types for part in peer_type.clocks}
+    names = [group.name for group in system.groups]
+    owner = np.repeat(np.arange(len(names)), [group.count for group in system.groups])
+    for link in system.links:
+        if len(link.clocks) == 1:
+            used.add(link.clock)
+            continue
+        own = {(pair.sender, pair.receiver): pair.clock for pair in link.pairs}
+        several = [(g, g) for g, group in enumerate(system.groups) if group.count > 1]
+        pairs = {*itertools.permutations(range(len(names)), 2), *several}
+        if link.graph.shape != "complete":
+            pairs = {*map(tuple, owner[arcs(link.graph, len(owner))[0]].tolist())}
+        used |= {own.get((names[sender], names[receiver])) or link.clock for sender, receiver in pairs}
+    return frozenset(used)
 
 
 def _received(

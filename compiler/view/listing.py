@@ -26,6 +26,7 @@ from apc.compiler.equations.solution import Assignment, ImplicitBlock
 from apc.compiler.equations.terms import text_of
 from apc.compiler.language.unit_text import format_dimension
 from apc.compiler.multiples import common_multiple
+from apc.compiler.peer_counts import clocks_in_use
 from apc.compiler.pipeline import each_stage
 from apc.compiler.topology.topology import Topology
 from apc.compiler.view.diagram import Diagram, build_diagram, node_of, seconds, shape_of
@@ -168,7 +169,8 @@ def schedule(system: Model) -> dict[str, Any]:
     """
     timings = {timing.name: timing.value for timing in system.timings}
     periods = {clock.name: timings[clock.period] for clock in system.clocks}
-    frame = common_multiple(periods.values()) if periods else None
+    used = clocks_in_use(system)
+    frame = common_multiple(periods[name] for name in used) if used else None
     return {
         "frame_s": None if frame is None else float(frame),
         "clocks": [
@@ -176,7 +178,7 @@ def schedule(system: Model) -> dict[str, Any]:
                 "clock": clock.name,
                 "period_s": float(periods[clock.name]),
                 "first_s": float(timings[clock.phase]),
-                "ticks": int(frame / periods[clock.name]) if frame is not None else 0,
+                "ticks": int(frame / periods[clock.name]) if frame and clock.name in used else 0,
                 "computes": [
                     *dict.fromkeys(
                         name

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation, nearest
 from apc.compiler.language.vectors import whole_and_index
+from apc.compiler.peer_counts import clocks_in_use
 from apc.compiler.wording import no_more
 from apc.parameter_values.parameters import resolve
 from apc.support.option_value import option_value
@@ -134,9 +135,7 @@ def _fastest(system: Model) -> float:
 def _fastest_clock(system: Model) -> tuple[Fraction, Fraction]:
     """Return the period and phase of the fastest clock in use, in seconds."""
     timings = resolve(system).timings
-    used = {part.clock for peer_type in system.peer_types for part in peer_type.clocks} | {
-        clock for link in system.links for clock in link.clocks
-    }
+    used = clocks_in_use(system)
     clocks = [clock for clock in system.clocks if clock.name in used]
     if not clocks:
         message = "the topology has no clock; transparency is defined for sampled forces"

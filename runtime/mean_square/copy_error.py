@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apc.compiler.compiled import Model, PeerType
+from apc.compiler.peer_counts import clocks_in_use
 from apc.lifting.devices import Device, coupled_directly, find_device
 from apc.lifting.frame_inputs import with_holds, with_ports
 from apc.linearization.linear_subsystem import LinearSubsystem
@@ -88,9 +89,7 @@ def forced(system: Model, reception: PerTickReception, first: Fraction = Fractio
     """
     unit_of = {parameter.name: parameter.unit for parameter in system.parameters}
     direct = coupled_directly(system.peer_types)
-    used_clocks = {part.clock for peer_type in system.peer_types for part in peer_type.clocks} | {
-        clock for link in system.links for clock in link.clocks
-    }
+    used_clocks = clocks_in_use(system)
     fastest = min(
         (clock for clock in system.clocks if clock.name in used_clocks),
         key=lambda clock: reception.timings[clock.period],

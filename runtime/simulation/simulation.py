@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
+from apc.compiler.peer_counts import clocks_in_use
 from apc.compiler.timings import part
 from apc.compiler.wording import no_more
 from apc.lifting.data_age import stamped
@@ -410,9 +411,11 @@ def _order(system: Model, population: Population, signals: Sequence[Signal]) -> 
 
 def _ticks_at_zero(system: Model, numbers: ResolvedNumbers) -> bool:
     """Return whether the fastest clock ticks at time 0."""
-    if not system.clocks:
+    used = clocks_in_use(system)
+    clocks = [clock for clock in system.clocks if clock.name in used]
+    if not clocks:
         return True
-    fastest = min(system.clocks, key=lambda clock: numbers.timings[clock.period])
+    fastest = min(clocks, key=lambda clock: numbers.timings[clock.period])
     return numbers.timings[fastest.phase] == 0
 
 

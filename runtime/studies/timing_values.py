@@ -18,6 +18,7 @@ from functools import lru_cache
 from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.multiples import common_divisor, common_multiple
+from apc.compiler.peer_counts import clocks_in_use
 from apc.compiler.wording import with_unit
 from apc.parameter_values.overrides import Override, apply
 from apc.parameter_values.parameter_names import ParameterRef, unit_of
@@ -110,8 +111,7 @@ def _frame_ticks(system: Model, parameter_ref: ParameterRef, value: Fraction) ->
         timings = resolve(system_with_delay(system, parameter_ref, value)).timings
     except ApcError:  # beyond the bounds of the number
         return math.inf
-    used = {partition.clock for peer_type in system.peer_types for partition in peer_type.clocks}
-    used |= {clock for link in system.links for clock in link.clocks}
+    used = clocks_in_use(system)
     periods = [timings[clock.period] for clock in system.clocks if clock.name in used]
     if not all(period > 0 for period in periods):
         return math.inf

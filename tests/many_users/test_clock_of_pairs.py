@@ -18,6 +18,7 @@ import apc
 from apc.__main__ import run
 from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError
+from apc.compiler.peer_counts import clocks_in_use
 from apc.studies.effort import effort
 from tests.topologies import compiled, replaced
 
@@ -420,3 +421,16 @@ def test_a_run_in_real_time_does_what_is_simulated(
     reported = json.loads(capsys.readouterr().out)
     assert reported["why_not"] == "" and reported["differences"]["N"][1] > 1e-3
     assert max(far for far, _ in reported["differences"].values()) <= 1e-9
+
+
+def test_a_clock_of_a_link_that_sends_no_packet_has_no_effect() -> None:
+    """All packets of two peers are sent at another clock than that of the link."""
+    both = "pairs: {mobile: {user: {clock: slow}}, user: {mobile: {clock: slow}}}"
+    text = topology("FullMesh", 60, users=1, link=both, **QUICK)
+    unused = compiled(replaced(text, ("fast: 125 Hz", "fast: 0.3 ms")))
+    link = compiled(replaced(text, ("{clock: fast", "{clock: slow"), (f", {both}", "")))
+    assert apc.analyze(unused).spectral_radius == pytest.approx(apc.analyze(link).spectral_radius, rel=1e-12)
+    assert clocks_in_use(unused) == clocks_in_use(link) == {"haptic", "slow"}
+    assert apc.transparency(unused, [1.0, 10.0]) is not None
+    more = apc.set_parameters(unused, {"user.count": "2"})
+    assert clocks_in_use(more) == {"haptic", "fast", "slow"}
