@@ -416,8 +416,9 @@ class _SinglePeer(InterpretedEngine):
         """Execute a frame whose packets have no receiver, so that loading and compiling precede the run."""
         self.advance(0, 1, forces_in_time(replace(self.period.simulation, length=1), 0))
         self.begin(0)
-        for record in (self.log, *self.observed):
-            record.clear()
+        self.log.clear()
+        for packets in self.observed:
+            packets.clear()
         self.instant = self.period.first * self.loop.frame_ns
 
     # ---- joins and leaves
