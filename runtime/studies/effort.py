@@ -106,7 +106,7 @@ def _directed_link_rates(
     """
     if link.graph.shape == "complete":
         received = receives * (int((sends * counts).sum()) - sends)
-        receivers = sends * (rates @ (receives * counts) - rates.diagonal() * receives)
+        receivers: Floats = sends * (rates @ (receives * counts) - rates.diagonal() * receives)
         return received, receivers, receivers * counts
     peers, starts = int(counts.sum()), np.cumsum([0, *counts[:-1]])
     group = np.repeat(np.arange(len(counts)), counts)
@@ -114,7 +114,7 @@ def _directed_link_rates(
     pairs = pairs[sends[group[pairs[:, 0]]] & receives[group[pairs[:, 1]]]]
     senders = np.bincount(pairs[:, 1], minlength=peers)
     of_pair = rates[group[pairs[:, 0]], group[pairs[:, 1]]]
-    receivers = np.bincount(pairs[:, 0], of_pair, minlength=peers)
+    receivers = np.asarray(np.bincount(pairs[:, 0], of_pair, minlength=peers), dtype=np.float64)
     return (
         np.maximum.reduceat(senders, starts),
         np.maximum.reduceat(receivers, starts),
