@@ -117,17 +117,17 @@ def graph_of_groups(
     return Graph("arcs", *arcs_of_groups(entries, counts), tuple(entries))
 
 
-def clocks_in_use(system: Model) -> frozenset[str]:
+def clocks_in_use(model: Model) -> frozenset[str]:
     """Return the clocks of all peer types, and those whose ticks send packets from some group to another."""
-    used = {part.clock for peer_type in system.peer_types for part in peer_type.clocks}
-    names = [group.name for group in system.groups]
-    owner = np.repeat(np.arange(len(names)), [group.count for group in system.groups])
-    for link in system.links:
+    used = {part.clock for peer_type in model.peer_types for part in peer_type.clocks}
+    names = [group.name for group in model.groups]
+    owner = np.repeat(np.arange(len(names)), [group.count for group in model.groups])
+    for link in model.links:
         if len(link.clocks) == 1:
             used.add(link.clock)
             continue
         own = {(pair.sender, pair.receiver): pair.clock for pair in link.pairs}
-        several = [(g, g) for g, group in enumerate(system.groups) if group.count > 1]
+        several = [(g, g) for g, group in enumerate(model.groups) if group.count > 1]
         pairs = {*itertools.permutations(range(len(names)), 2), *several}
         if link.graph.shape != "complete":
             pairs = {*map(tuple, owner[arcs(link.graph, len(owner))[0]].tolist())}
@@ -159,12 +159,12 @@ def _received(
     return [Fraction(part[0]) if np.all(part == part[0]) else part.astype(np.float64) for part in parts]
 
 
-def recounted(system: Model, counts: Mapping[str, Fraction], location: SourceLocation) -> Model:
+def recounted(model: Model, counts: Mapping[str, Fraction], location: SourceLocation) -> Model:
     """Return a model with other numbers of peers.
 
     Parameters
     ----------
-    system
+    model
         The model, in which `peers` and its dependent parameters have their new values.
     counts
         The new count of each group.
@@ -178,11 +178,11 @@ def recounted(system: Model, counts: Mapping[str, Fraction], location: SourceLoc
     """
     mistakes = Mistakes()
     total = sum(counts.values())
-    others = {count_of(link.name): total - 1 for link in system.links}
-    arcs = [link.name for link in system.links if link.graph.shape == "arcs" and not link.graph.groups]
-    shaped = [link.name for link in system.links if link.graph.shape != "complete"]
-    groups = [replace(group, count=int(counts[group.name])) for group in system.groups]
-    for group in system.groups:
+    others = {count_of(link.name): total - 1 for link in model.links}
+    arcs = [link.name for link in model.links if link.graph.shape == "arcs" and not link.graph.groups]
+    shaped = [link.name for link in model.links if link.graph.shape != "complete"]
+    groups = [replace(group, count=int(counts[group.name])) for group in model.groups]
+    for group in model.groups:
         count, name = counts[group.name], group_count(group.name)
         local = [column.name for column in group.columns if column.name not in others]
         with mistakes:
@@ -201,7 +201,7 @@ def recounted(system: Model, counts: Mapping[str, Fraction], location: SourceLoc
             if shaped and total > MOST_PLACED:
                 expected = f"at most {MOST_PLACED:,} peers where {shaped[0]} isn't complete"
                 raise fault("E626", location, name, expected, f"{int(total):,}")
-    if not mistakes and total < least_peers(system.peer_types):
+    if not mistakes and total < least_peers(model.peer_types):
         message, expected = "total number of peers", "at least 2, as a part receives from the other peers"
         raise fault("E626", location, message, expected, f"{int(total)}")
     mistakes.raise_if_any()
@@ -210,17 +210,17 @@ def recounted(system: Model, counts: Mapping[str, Fraction], location: SourceLoc
         replace(link, graph=graph_of_groups(link.graph.groups, group_counts, location, "E626"))
         if link.graph.groups
         else link
-        for link in system.links
+        for link in model.links
     )
     locations = dict.fromkeys((link.name for link in links), location)
-    refuse_equal_sums(system.peer_types, links, int(total), locations)
+    refuse_equal_sums(model.peer_types, links, int(total), locations)
     return replace(
-        system,
+        model,
         links=links,
-        groups=with_received(groups, system.peer_types, links),
+        groups=with_received(groups, model.peer_types, links),
         parameters=tuple(
             replace(parameter, value=float(others[parameter.name])) if parameter.name in others else parameter
-            for parameter in system.parameters
+            for parameter in model.parameters
         ),
     )
 

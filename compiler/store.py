@@ -27,17 +27,17 @@ from apc.compiler.timings import part
 
 
 @part("save")
-def save(system: Model, path: Path, *, compiled: bool = False) -> None:
+def save(model: Model, path: Path, *, compiled: bool = False) -> None:
     """Write a model to a file. Raises ApcError if the file can't be written.
 
     `compiled` is whether the model is the unchanged result of compiling its texts.
     """
-    write_bytes(path, packed(system.origin, model_of(system), compiled=compiled))
+    write_bytes(path, packed(model.origin, model_of(model), compiled=compiled))
 
 
-def model_of(system: Model) -> bytes:
+def model_of(model: Model) -> bytes:
     """Return the bytes of a model without its source texts."""
-    return encoded(replace(system, origin=Origin(system.origin.topology)))
+    return encoded(replace(model, origin=Origin(model.origin.topology)))
 
 
 def opened(archive: Archive) -> Model:
@@ -46,9 +46,9 @@ def opened(archive: Archive) -> Model:
     return replace(decoded(archive.model), origin=archive.origin)
 
 
-def encoded(system: Model) -> bytes:
+def encoded(model: Model) -> bytes:
     """Return a model as bytes."""
-    return msgspec.msgpack.encode(system, enc_hook=_plain)
+    return msgspec.msgpack.encode(model, enc_hook=_plain)
 
 
 def decoded(model: bytes) -> Model:

@@ -105,29 +105,29 @@ def analysis_report(numeric: NumericModel, *, method: str = "auto", certify: boo
     return _with_equilibrium(numeric.model, _run_method(numeric, method=method, certify=certify)[0])
 
 
-def _with_equilibrium(system: Model, analysis: Analysis) -> Analysis:
+def _with_equilibrium(model: Model, analysis: Analysis) -> Analysis:
     """Return an analysis with the equilibrium at which its model is linearized, if any."""
-    if not system.at_equilibrium:
+    if not model.at_equilibrium:
         return analysis
-    return replace(analysis, equilibrium=operating_point_from(system))
+    return replace(analysis, equilibrium=operating_point_from(model))
 
 
 def _run_method(numeric: NumericModel, *, method: str, certify: bool) -> tuple[Analysis, Side]:
     """Return the analysis on the worst side of the kinks at the start values, and this side."""
-    system = numeric.model
+    model = numeric.model
     if method != PAPER:
         return analyze_sides(numeric, method=method, certify=certify)
     if certify:
         message = "method paper has no proof, because its matrices are rounded"
         raise ApcError(
-            Diagnostic("E850", SourceLocation(system.origin.topology), message, fix="--method auto --certify")
+            Diagnostic("E850", SourceLocation(model.origin.topology), message, fix="--method auto --certify")
         )
-    paper_analysis: Analysis = require_extension("paper_method").analyze_paper(system)
+    paper_analysis: Analysis = require_extension("paper_method").analyze_paper(model)
     return paper_analysis, Side("", numeric)
 
 
 def answer(
-    system: Model,
+    model: Model,
     *,
     method: str = "auto",
     certify: bool = False,
@@ -141,7 +141,7 @@ def answer(
 
     Parameters
     ----------
-    system
+    model
         The model, with the parameter values to analyze.
     method
         See `analysis.analyze`.
@@ -164,7 +164,7 @@ def answer(
     ApcError
         As `analysis.analyze` and `robust_stability.prove_robust_stability`.
     """
-    numeric = numeric_model(system)
+    numeric = numeric_model(model)
     analysis, side = _run_method(numeric, method=method, certify=certify)
     modes, notes = _contact_modes(numeric)
     orders, order_warning, order_notes = _event_orders(numeric, analysis, every=every_convention)
@@ -176,8 +176,8 @@ def answer(
         notes = (*notes, not_installed("switching"))
     return AnalysisReport(
         analysis=replace(
-            _with_equilibrium(system, analysis),
-            notes=(*analysis.notes, *notes, *order_notes, *_published_conditions(system)),
+            _with_equilibrium(model, analysis),
+            notes=(*analysis.notes, *notes, *order_notes, *_published_conditions(model)),
         ),
         network=_over_network(numeric, analysis, nominal, certify=certify, requested=margins),
         sensitivities=sensitivity_result,
@@ -187,9 +187,9 @@ def answer(
         limit_cycle=limit_cycle,
         event_order=orders,
         order_warning=order_warning,
-        box=robust_stability(system, box, cells=cells) if box else None,
+        box=robust_stability(model, box, cells=cells) if box else None,
         no_limit_cycle=no_limit_cycle,
-        warnings=system.warnings,
+        warnings=model.warnings,
     )
 
 
@@ -209,11 +209,11 @@ def _event_orders(
     return None, orders.warning, (orders.not_repeated,) if orders.not_repeated else ()
 
 
-def _published_conditions(system: Model) -> tuple[str, ...]:
+def _published_conditions(model: Model) -> tuple[str, ...]:
     """Return the texts of published conditions; imported here, as few topologies have such parts."""
     from apc.haptics.published_limits import published_limits
 
-    return published_limits(system)
+    return published_limits(model)
 
 
 def _over_network(
@@ -265,7 +265,7 @@ def _limit_cycle(numeric: NumericModel) -> tuple[Result | None, str]:
 
 
 def robust_stability(
-    system: Model,
+    model: Model,
     box: Sequence[Range],
     *,
     passive: bool = False,
@@ -278,7 +278,7 @@ def robust_stability(
 
     Parameters
     ----------
-    system
+    model
         The model.
     box
         Ranges of parameters.
@@ -300,25 +300,25 @@ def robust_stability(
     from apc.network.nominal_criterion import channel_numbers, unreliable
     from apc.studies.representative_delays import is_delay
 
-    if passive and not (len(box) == 1 and is_delay(system, box[0].free)):
+    if passive and not (len(box) == 1 and is_delay(model, box[0].free)):
         message = "with passive operators only a range of a link delay can be in a box"
         fix = "apc region --hands passive, or apc critical --hands passive"
         raise ApcError(Diagnostic("E930", SourceLocation("--box"), message, fix=fix))
     extension = require_extension("parameter_boxes")
     result: RobustStability
-    if any(is_delay(system, interval.free) for interval in box):
+    if any(is_delay(model, interval.free) for interval in box):
         at_each = partial(proved_at, passive=passive, cells=cells, inside=inside)
-        nominal = not passive and not unreliable(system)
-        result = extension.prove_over_delay(system, box, at_each, nominal=nominal)
-    elif unreliable(system) or any(interval.free.name in channel_numbers(system) for interval in box):
-        result = extension.prove_mean_square(system, box, cells=cells)
+        nominal = not passive and not unreliable(model)
+        result = extension.prove_over_delay(model, box, at_each, nominal=nominal)
+    elif unreliable(model) or any(interval.free.name in channel_numbers(model) for interval in box):
+        result = extension.prove_mean_square(model, box, cells=cells)
     else:
-        result = extension.prove_robust_stability(system, box, cells=cells, inside=inside)
+        result = extension.prove_robust_stability(model, box, cells=cells, inside=inside)
     return result
 
 
 def proved_at(
-    system: Model,
+    model: Model,
     box: Sequence[Range],
     *,
     passive: bool = False,
@@ -329,32 +329,32 @@ def proved_at(
 
     Parameters
     ----------
-    system, box, passive, cells, inside
+    model, box, passive, cells, inside
         As for `robust_stability`.
     """
     if box:
-        return robust_stability(system, box, passive=passive, cells=cells, inside=inside)
+        return robust_stability(model, box, passive=passive, cells=cells, inside=inside)
     from apc.network.nominal_criterion import unreliable
 
     verdict: Term
     if passive:
         from apc.haptics.absolute_stability import absolute_stability
 
-        hands = absolute_stability(numeric_model(system))
+        hands = absolute_stability(numeric_model(model))
         verdict, stable, limitations = hands.verdict, hands.stable, hands.limitations
-    elif unreliable(system):
+    elif unreliable(model):
         from apc.mean_square.mean_square_stability import mean_square_stability
 
-        numeric = numeric_model(system)
+        numeric = numeric_model(model)
         network = mean_square_stability(numeric)
         assert network is not None, "a link is unreliable"
         verdict, stable, limitations = network.verdict, network.stable, near_start(numeric)
     else:
-        analysis = analyze(numeric_model(system))
+        analysis = analyze(numeric_model(model))
         verdict, stable, limitations = analysis.verdict, analysis.stable, analysis.limitations
         if stable and inside != 1 and not analysis.spectral_radius + analysis.spectral_radius_error < inside:
             stable = False if analysis.spectral_radius - analysis.spectral_radius_error >= inside else None
-    return RobustStability(system.name, (), verdict, stable, 1, float(stable is None), (), (), limitations)
+    return RobustStability(model.name, (), verdict, stable, 1, float(stable is None), (), (), limitations)
 
 
 def sensitivities_of(numeric: NumericModel, analysis: Analysis) -> Sensitivities:
@@ -400,16 +400,16 @@ def _too_large(numeric: NumericModel, analysis: Analysis) -> str:
     return ""
 
 
-def _too_many_peers(system: Model, analysis: Analysis) -> str:
+def _too_many_peers(model: Model, analysis: Analysis) -> str:
     """Return the reason for omitting sensitivities; empty unless very many peers differ or are on a graph."""
-    complete = all(link.graph.shape == "complete" for link in system.links)
+    complete = all(link.graph.shape == "complete" for link in model.links)
     irregular = analysis.method == "determinant" or not complete
-    return "not computed for a population of this size" if irregular and system.peers > FEW_PEERS else ""
+    return "not computed for a population of this size" if irregular and model.peers > FEW_PEERS else ""
 
 
-def _too_many_products(system: Model) -> str:
+def _too_many_products(model: Model) -> str:
     """Return the reason for omitting derivatives; empty unless parameters and states are very many."""
-    free, states = len(varied(system)), max(len(peer_type.states) for peer_type in system.peer_types)
+    free, states = len(varied(model)), max(len(peer_type.states) for peer_type in model.peer_types)
     if free * states**3 > MOST_PRODUCTS:
         return f"not computed: {free:,} parameters and {states:,} states take too long"
     return ""

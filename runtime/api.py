@@ -83,9 +83,9 @@ def compile(path: str | Path) -> Model:
     from apc.compiler.pipeline import compile_topology
     from apc.lifting.start_checks import check_values
 
-    system = compile_topology(Path(path))
-    check_values(system)
-    return system
+    model = compile_topology(Path(path))
+    check_values(model)
+    return model
 
 
 @checked
@@ -347,12 +347,12 @@ def critical(
     """
     from apc.studies import critical_values
 
-    system = _model(model, params, operating_point)
+    compiled_model = _model(model, params, operating_point)
     low, high = (
         item if item is None or isinstance(item, str) else _si_number(parameter, item)
         for item in (lower, upper)
     )
-    return critical_values.critical(system, parameter, lower=low, upper=high, criterion=criterion)
+    return critical_values.critical(compiled_model, parameter, lower=low, upper=high, criterion=criterion)
 
 
 @checked
@@ -545,10 +545,14 @@ def fit(
     """
     from apc.simulation.settings import DEFAULT, parse_method
 
-    system, extension = _model(model, params), require_extension("parameter_fit")
+    compiled_model, extension = _model(model, params), require_extension("parameter_fit")
     chosen = DEFAULT if method is None else parse_method(method)
-    ranges = extension.read_free(system, [(name, _values(name, value)) for name, value in free.items()])
-    result: ParameterFit = extension.fit(system, Path(recording), ranges, signals=signals, method=chosen)
+    ranges = extension.read_free(
+        compiled_model, [(name, _values(name, value)) for name, value in free.items()]
+    )
+    result: ParameterFit = extension.fit(
+        compiled_model, Path(recording), ranges, signals=signals, method=chosen
+    )
     return result
 
 
@@ -739,9 +743,9 @@ def robust_stability(
     from apc.analysis_report import robust_stability
     from apc.studies.parameter_ranges import parse_range
 
-    system = _model(model, params)
-    ranges = [parse_range(system, (name, _values(name, value))) for name, value in box.items()]
-    return robust_stability(system, ranges, cells=cells)
+    compiled_model = _model(model, params)
+    ranges = [parse_range(compiled_model, (name, _values(name, value))) for name, value in box.items()]
+    return robust_stability(compiled_model, ranges, cells=cells)
 
 
 @checked
@@ -816,13 +820,13 @@ def region(
     from apc.regions import stable_region
     from apc.regions.axes import parse_axes
 
-    system = _model(model, params, operating_point)
+    compiled_model = _model(model, params, operating_point)
     first, second = (
         axis if axis is None or isinstance(axis, str) else (axis[0], _values(axis[0], axis[1:]))
         for axis in (x, y)
     )
-    axes = parse_axes(system, first, second)
-    return stable_region.region(numeric_model(system), axes, criterion=criterion)
+    axes = parse_axes(compiled_model, first, second)
+    return stable_region.region(numeric_model(compiled_model), axes, criterion=criterion)
 
 
 @checked
@@ -877,9 +881,11 @@ def tune(
     from apc.lifting.rest_position import linearized_at
     from apc.tuning import tuner
 
-    system, tuning_spec = _tuning_spec(model, params, free, over, criterion, maximize, minimize, constraint)
-    system = linearized_at(system, operating_point)
-    return tuner.tune(system, tuning_spec, seconds=float("inf") if seconds is None else seconds)
+    compiled_model, tuning_spec = _tuning_spec(
+        model, params, free, over, criterion, maximize, minimize, constraint
+    )
+    compiled_model = linearized_at(compiled_model, operating_point)
+    return tuner.tune(compiled_model, tuning_spec, seconds=float("inf") if seconds is None else seconds)
 
 
 @checked
@@ -923,10 +929,12 @@ def pareto_front(
     """
     from apc.tuning.specification import read_tradeoff
 
-    system, tuning_spec = _tuning_spec(model, params, free, over, criterion, maximize, minimize, constraint)
+    compiled_model, tuning_spec = _tuning_spec(
+        model, params, free, over, criterion, maximize, minimize, constraint
+    )
     until = float("inf") if seconds is None else seconds
     result: ParetoFront = require_extension("pareto_front").pareto_front(
-        system, tuning_spec, read_tradeoff(tradeoff), points=points, seconds=until
+        compiled_model, tuning_spec, read_tradeoff(tradeoff), points=points, seconds=until
     )
     return result
 
@@ -945,15 +953,15 @@ def _tuning_spec(
     from apc.tuning.specification import gripped_as_studied, read_tuning_spec
 
     used_criterion: str | None = criterion
-    system = _model(model, values)
+    compiled_model = _model(model, values)
     if criterion is None:
-        system, used_criterion = gripped_as_studied(system)
+        compiled_model, used_criterion = gripped_as_studied(compiled_model)
     ranges, required = (
         [(name, _values(name, value)) for name, value in (named_ranges or {}).items()]
         for named_ranges in (free, over)
     )
     tuning_spec = read_tuning_spec(
-        system,
+        compiled_model,
         ranges,
         maximize=maximize,
         minimize=minimize,
@@ -961,7 +969,7 @@ def _tuning_spec(
         over=required,
         criterion=used_criterion,
     )
-    return system, tuning_spec
+    return compiled_model, tuning_spec
 
 
 @checked
@@ -1000,11 +1008,11 @@ def sweep(
     from apc.studies import resumable_sweep
 
     path = None if out is None else Path(out)
-    system = _model(model, params)
-    _check_out(model, system, path)
+    compiled_model = _model(model, params)
+    _check_out(model, compiled_model, path)
     values = {name: _values(name, given) for name, given in over.items()}
     return resumable_sweep.sweep(
-        system, values, of=of, criterion=criterion, out=path, jobs=jobs, cluster=cluster
+        compiled_model, values, of=of, criterion=criterion, out=path, jobs=jobs, cluster=cluster
     )
 
 
@@ -1050,12 +1058,12 @@ def _numeric(model: TopologySource, params: Values | None, operating_point: Poin
     return numeric_model(_model(model, params, operating_point))
 
 
-def _check_out(model: TopologySource, system: Model, path: Path | None) -> None:
+def _check_out(model: TopologySource, compiled_model: Model, path: Path | None) -> None:
     """Raise ApcError if an output file would overwrite the input of the model."""
     if path is not None and not isinstance(model, Model):
         from apc.inputs.open_model import check_outputs
 
-        check_outputs(Path(model), (name for name, _ in system.origin.texts), {"out=": path})
+        check_outputs(Path(model), (name for name, _ in compiled_model.origin.texts), {"out=": path})
 
 
 @checked
@@ -1118,20 +1126,20 @@ def simulate(
     from apc.simulation import trajectory
     from apc.simulation.settings import DEFAULT, parse_method
 
-    system = _model(model, params)
+    compiled_model = _model(model, params)
     if impulse is not None:
         from apc.simulation import initial_velocity as push
 
-        system, _ = push.initial_velocity(system, impulse)
-        if duration is None and system.experiment.duration is None:
+        compiled_model, _ = push.initial_velocity(compiled_model, impulse)
+        if duration is None and compiled_model.experiment.duration is None:
             duration = float(push.WATCHED)
     if trace_of is not None:
-        system = require_extension("loss_models").worst_trace(system)
+        compiled_model = require_extension("loss_models").worst_trace(compiled_model)
     if joins or leaves:
         texts = ([f"{peer}={_time(at)}" for peer, at in (times or {}).items()] for times in (joins, leaves))
-        system = require_extension("changing_counts").with_peer_times(system, *texts)
+        compiled_model = require_extension("changing_counts").with_peer_times(compiled_model, *texts)
     return trajectory.simulate(
-        system,
+        compiled_model,
         duration=_duration(duration),
         signals=signals,
         jit=jit,
@@ -1238,10 +1246,10 @@ def export(
 
     path = None if out is None else Path(out)
     chosen = formats.format_of(to, path, option="=")
-    system = _model(model, params)
-    _check_out(model, system, path)
+    compiled_model = _model(model, params)
+    _check_out(model, compiled_model, path)
     requested = formats.ExportRequest(open_at, tuple(symbolic), peer, device, method)
-    return formats.export(system, chosen, requested, path)
+    return formats.export(compiled_model, chosen, requested, path)
 
 
 @checked

@@ -267,9 +267,9 @@ def _curves(one: Limit) -> float:
 
 
 def _margin(one: Limit) -> float:
-    system = compiled(one.text)
+    model = compiled(one.text)
     begin = {one.parameter: f"{one.value / 2} N/m"}
-    rows = {row.parameter: row for row in apc.margins(system, params=begin).rows}
+    rows = {row.parameter: row for row in apc.margins(model, params=begin).rows}
     return rows[one.parameter].value
 
 

@@ -161,15 +161,15 @@ def _equation_lines(flat: FlatSystem) -> Iterator[str]:
 # ---- the schedule ----
 
 
-def schedule(system: Model) -> dict[str, Any]:
+def schedule(model: Model) -> dict[str, Any]:
     """Return the events of one frame as plain data: clocks, holds, links and received values.
 
     Times are in seconds. `on_the_way` is the largest number of packets of one sender in transit; `age_s` has
     the age of the newest delivered packet at its arrival and at the arrival of the next.
     """
-    timings = {timing.name: timing.value for timing in system.timings}
-    periods = {clock.name: timings[clock.period] for clock in system.clocks}
-    used = clocks_in_use(system)
+    timings = {timing.name: timing.value for timing in model.timings}
+    periods = {clock.name: timings[clock.period] for clock in model.clocks}
+    used = clocks_in_use(model)
     frame = common_multiple(periods[name] for name in used) if used else None
     return {
         "frame_s": None if frame is None else float(frame),
@@ -182,15 +182,15 @@ def schedule(system: Model) -> dict[str, Any]:
                 "computes": [
                     *dict.fromkeys(
                         name
-                        for peer_type in system.peer_types
+                        for peer_type in model.peer_types
                         for item in peer_type.clocks
                         if item.clock == clock.name
                         for name in item.outputs
                     )
                 ],
-                "sends": [link.name for link in system.links if clock.name in link.clocks],
+                "sends": [link.name for link in model.links if clock.name in link.clocks],
             }
-            for clock in system.clocks
+            for clock in model.clocks
         ],
         "holds": [
             {
@@ -200,7 +200,7 @@ def schedule(system: Model) -> dict[str, Any]:
                 "delay_s": float(timings[hold.delay]),
                 "held_s": float(periods[hold.clock]),
             }
-            for peer_type in system.peer_types
+            for peer_type in model.peer_types
             for hold in peer_type.holds
         ],
         "links": [
@@ -211,7 +211,7 @@ def schedule(system: Model) -> dict[str, Any]:
                 "sends": [
                     *dict.fromkeys(
                         name
-                        for peer_type in system.peer_types
+                        for peer_type in model.peer_types
                         for send in peer_type.sends
                         if send.link == link.name
                         for name in send.channels
@@ -222,7 +222,7 @@ def schedule(system: Model) -> dict[str, Any]:
                 "on_the_way": math.ceil(timings[delay] / periods[clock]),
                 "age_s": [float(timings[delay]), float(timings[delay] + periods[clock])],
             }
-            for link in system.links
+            for link in model.links
             for sender, receiver, delay, clock in (
                 ("", "", link.delay, link.clock),
                 *((pair.sender, pair.receiver, pair.delay, pair.clock or link.clock) for pair in link.pairs),
@@ -236,7 +236,7 @@ def schedule(system: Model) -> dict[str, Any]:
                 "link": receive.link,
                 "pairwise": receive.edge is not None or receive.operator in PAIRWISE,
             }
-            for peer_type in system.peer_types
+            for peer_type in model.peer_types
             for clock in peer_type.clocks
             for receive in clock.receives
         ],

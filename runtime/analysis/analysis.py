@@ -327,10 +327,10 @@ def _analyze(side: Side, *, method: str, certify: bool, exact_work: float) -> An
         As for `analyze_worst_side`.
     """
     numeric = side.numeric
-    system, nonlinear = numeric.model, not numeric.affine
-    elements = replaced_elements(system)
+    model, nonlinear = numeric.model, not numeric.affine
+    elements = replaced_elements(model)
     linearized = nonlinear or bool(elements)
-    with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
+    with single_threaded(), finite_equations(model.origin.topology), np.errstate(all="ignore"):
         plan, spectrum, notes = _spectrum(numeric, method, certify=certify, exact_work=exact_work)
         neutral_modes = _neutral_modes(spectrum, plan.loops, () if plan.loops else representatives(numeric))
     verdict, proof = _verdict(spectrum, neutral_modes), spectrum.proof
@@ -338,12 +338,12 @@ def _analyze(side: Side, *, method: str, certify: bool, exact_work: float) -> An
         proof = replace(proof, outcome=ProofOutcome.STABLE)  # the drift is that of an unobservable memory
     scopes = (
         (ProofScope.LINEARIZATION, linearized),
-        (ProofScope.NOMINAL_NETWORK, bool(unreliable(system))),
+        (ProofScope.NOMINAL_NETWORK, bool(unreliable(model))),
     )
     if proof:
         proof = replace(proof, scope=tuple(scope for scope, applies in scopes if applies))
     return Analysis(
-        topology=system.name,
+        topology=model.name,
         peers=numeric.exchange.peers,
         frame_s=float(numeric.schedules[0].frame_s),
         states_per_peer=max(map(states_of, numeric.schedules, numeric.subsystems)),
@@ -359,8 +359,8 @@ def _analyze(side: Side, *, method: str, certify: bool, exact_work: float) -> An
         proof=proof,
         limitations=(
             *elements,
-            *(_start_limitations(plan.groups, at_rest=system.at_equilibrium) if nonlinear else ()),
-            *limitations(system),
+            *(_start_limitations(plan.groups, at_rest=model.at_equilibrium) if nonlinear else ()),
+            *limitations(model),
         ),
         unobservable=neutral_modes.names,
         translations=neutral_modes.translations,
@@ -376,7 +376,7 @@ def _spectrum(
 
     An undecided determinant is followed by the matrices, where they fit.
     """
-    system = numeric.model
+    model = numeric.model
     plan = make_plan(numeric, method)
     notes: tuple[Note, ...] = ()
     if not plan.groups:
@@ -387,11 +387,11 @@ def _spectrum(
         if method == "auto" and spectrum.stable is None and matrices_fit:
             decomposed = decompose(plan.groups, numeric.exchange)
             plan = replace(plan, method=decomposed.method, notes=decomposed.notes)
-            spectrum = _solve_closed(system, plan.loops, certify=certify, exact_work=exact_work)
+            spectrum = _solve_closed(model, plan.loops, certify=certify, exact_work=exact_work)
     else:
-        spectrum = _solve_closed(system, plan.loops, certify=certify, exact_work=exact_work)
+        spectrum = _solve_closed(model, plan.loops, certify=certify, exact_work=exact_work)
     if method == "determinant" and not np.isfinite(spectrum.spectral_radius_error):
-        raise cannot_serve(system, method, "rounding within a frame exceeds the eigenvalues of single peers")
+        raise cannot_serve(model, method, "rounding within a frame exceeds the eigenvalues of single peers")
     if certify and (not plan.groups or plan.method == "determinant"):
         notes = (*notes, Limitation(LimitationCode.NO_BALLS, (plan.method,)))
     return plan, spectrum, notes
@@ -451,7 +451,7 @@ def _has_other_states(group: PeerClass) -> bool:
 
 
 def _solve_closed(
-    system: Model, loops: Sequence[ModalSystem], *, certify: bool, exact_work: float
+    model: Model, loops: Sequence[ModalSystem], *, certify: bool, exact_work: float
 ) -> Spectrum:
     """Return the spectrum of loops from their matrices."""
     closed = tuple(close_loop(loop) for loop in loops)
@@ -459,7 +459,7 @@ def _solve_closed(
         np.isfinite(closed_system.matrix).all() and np.isfinite(closed_system.error).all()
         for closed_system in closed
     ):
-        raise ApcError(Diagnostic("E806", SourceLocation(system.origin.topology), TOO_LARGE))
+        raise ApcError(Diagnostic("E806", SourceLocation(model.origin.topology), TOO_LARGE))
     return solve_spectrum(closed, certify=certify, exact_work=exact_work)
 
 

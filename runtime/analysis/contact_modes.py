@@ -111,7 +111,7 @@ def contact_modes(
     ApcError
         E863 a contact, wall or limit with too many conditions.
     """
-    system = numeric.model
+    model = numeric.model
     switched = [find_switches(subsystem.peer_type) for subsystem in numeric.jacobians]
     with_nonlinear_loop = dict.fromkeys(
         switched_peer_type.peer_type.name
@@ -120,9 +120,9 @@ def contact_modes(
     )
     notes = tuple(f"not analyzed: {name}, which has a nonlinear loop" for name in with_nonlinear_loop)
     with np.errstate(all="ignore"):
-        parts = parts_of_peer_types(system, switched, numeric.numbers)
+        parts = parts_of_peer_types(model, switched, numeric.numbers)
     names = tuple(dict.fromkeys(part.name for parts_of_type in parts for part in parts_of_type))
-    parts_of_groups = [frozenset(part.name for part in parts[group.peer_type]) for group in system.groups]
+    parts_of_groups = [frozenset(part.name for part in parts[group.peer_type]) for group in model.groups]
 
     def subsystem(peer_type: int, on: frozenset[str]) -> SubsystemJacobians:
         """Return the Jacobians of a peer type with the parts named in `on` on, and all others off."""
@@ -138,11 +138,11 @@ def contact_modes(
         numbers: dict[tuple[int, frozenset[str]], int] = {}
         groups = tuple(
             replace(group, peer_type=numbers.setdefault((group.peer_type, parts_on), len(numbers)))
-            for group, parts_on in zip(system.groups, setting, strict=True)
+            for group, parts_on in zip(model.groups, setting, strict=True)
         )
         subsystems = tuple(subsystem(*number) for number in numbers)
-        peer_types = tuple(system.peer_types[peer_type] for peer_type, _ in numbers)
-        changed = replace(system, peer_types=peer_types, groups=groups)
+        peer_types = tuple(model.peer_types[peer_type] for peer_type, _ in numbers)
+        changed = replace(model, peer_types=peer_types, groups=groups)
         on = tuple(
             (group.name, tuple(sorted(parts_on))) for group, parts_on in zip(groups, setting, strict=True)
         )
@@ -168,12 +168,12 @@ def contact_modes(
             radius_excess=analysis.radius_excess,
         )
 
-    modes = tuple(mode(name, setting) for setting, name in _settings(system, names, parts_of_groups).items())
-    return ContactModes(system.name, names, modes, notes)
+    modes = tuple(mode(name, setting) for setting, name in _settings(model, names, parts_of_groups).items())
+    return ContactModes(model.name, names, modes, notes)
 
 
 def parts_of_peer_types(
-    system: Model, switched: Sequence[SwitchedPeerType], numbers: ResolvedNumbers
+    model: Model, switched: Sequence[SwitchedPeerType], numbers: ResolvedNumbers
 ) -> list[tuple[SwitchingPart, ...]]:
     """Return the switching parts of each peer type, at the parameters of its first peer.
 
@@ -184,7 +184,7 @@ def parts_of_peer_types(
     """
     parts: list[tuple[SwitchingPart, ...]] = []
     for index, switched_peer_type in enumerate(switched):
-        rows = [numbers.parameters[g][0] for g, group in enumerate(system.groups) if group.peer_type == index]
+        rows = [numbers.parameters[g][0] for g, group in enumerate(model.groups) if group.peer_type == index]
         parts.append(switching_parts(switched_peer_type, rows[0]) if rows else ())
     return parts
 
@@ -199,14 +199,14 @@ def settings(parts: Iterable[SwitchingPart], *, on: bool) -> dict[int, bool]:
 
 
 def _settings(
-    system: Model, names: Sequence[str], parts_of_groups: Sequence[frozenset[str]]
+    model: Model, names: Sequence[str], parts_of_groups: Sequence[frozenset[str]]
 ) -> dict[_Setting, str]:
     """Return the name of each contact mode by its setting, each setting once; empty if no part switches."""
     no_parts: frozenset[str] = frozenset()
     result = (
         {tuple(parts_of_groups): EVERYONE, tuple(no_parts for _ in parts_of_groups): NOBODY} if names else {}
     )
-    for index, group in enumerate(system.groups if names else ()):
+    for index, group in enumerate(model.groups if names else ()):
         single = tuple(part_names if g == index else no_parts for g, part_names in enumerate(parts_of_groups))
         result.setdefault(single, f"on at {group.name} alone")
     for name in names:
@@ -214,10 +214,10 @@ def _settings(
     return result
 
 
-def _missing_slope_note(system: Model, subsystems: Sequence[SubsystemJacobians]) -> str:
+def _missing_slope_note(model: Model, subsystems: Sequence[SubsystemJacobians]) -> str:
     """Return a note on a group whose piece has no slope at its start values, "" if all groups have slopes."""
-    numbers = resolve(system)
-    for group, rows in zip(system.groups, numbers.parameters, strict=True):
+    numbers = resolve(model)
+    for group, rows in zip(model.groups, numbers.parameters, strict=True):
         subsystem = subsystems[group.peer_type]
         if subsystem.affine or subsystem.edges:  # slopes everywhere, or linearized with their senders
             continue

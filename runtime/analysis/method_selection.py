@@ -71,12 +71,12 @@ class AnalysisPlan:
     notes: tuple[str, ...]
 
 
-def refuse_varying(system: Model, jacobians: Sequence[SubsystemJacobians]) -> None:
+def refuse_varying(model: Model, jacobians: Sequence[SubsystemJacobians]) -> None:
     """Raise an error if an equation's slopes vary with time: frozen at one instant they are another model.
 
     Parameters
     ----------
-    system
+    model
         The compiled model.
     jacobians
         One for each peer type.
@@ -90,7 +90,7 @@ def refuse_varying(system: Model, jacobians: Sequence[SubsystemJacobians]) -> No
         if names := varying_slopes(subsystem):
             message = f"the equation of {names[0]} multiplies a state by a function of time"
             why = "frames differ, so there is no verdict; use a simulation"
-            location = SourceLocation(system.origin.topology)
+            location = SourceLocation(model.origin.topology)
             raise ApcError(Diagnostic("E810", location, f"{message}: {why}", fix="apc simulate"))
 
 
@@ -110,11 +110,11 @@ def make_plan(numeric: NumericModel, method: str = "auto") -> AnalysisPlan:
         E804 a system of too many states for its matrix, E850 a method that is not applicable; and the errors
         of `refuse_varying` and `peer_classes.classes_of_peers`.
     """
-    system, exchange = numeric.model, numeric.exchange
+    model, exchange = numeric.model, numeric.exchange
     if method not in METHODS or method == PAPER:
-        raise cannot_serve(system, method, f"available methods: {', '.join(METHODS)}")
-    refuse_varying(system, numeric.jacobians)
-    populations_allowed = method in ("auto", "determinant") and not not_populations(system, numeric.jacobians)
+        raise cannot_serve(model, method, f"available methods: {', '.join(METHODS)}")
+    refuse_varying(model, numeric.jacobians)
+    populations_allowed = method in ("auto", "determinant") and not not_populations(model, numeric.jacobians)
     if populations_allowed and (
         (method == "determinant" and _is_short_and_complete(numeric)) or has_more_states(numeric, FEW_STATES)
     ):
@@ -123,7 +123,7 @@ def make_plan(numeric: NumericModel, method: str = "auto") -> AnalysisPlan:
             return _plan_populations(numeric)
         if method == "determinant":
             reason = f"the peers differ and are not completely connected over {sparse[0]}"
-            raise cannot_serve(system, method, reason)
+            raise cannot_serve(model, method, reason)
     groups = classes_of_peers(numeric)
     if is_large_ring(groups, exchange):
         message = f"a ring of {exchange.peers:,} peers has as many subsystems; the limit is {LARGEST_RING:,}"
@@ -137,7 +137,7 @@ def make_plan(numeric: NumericModel, method: str = "auto") -> AnalysisPlan:
     else:
         decomposed = decompose(groups, exchange)
         if method == "modes" and decomposed.method != "modes":
-            raise cannot_serve(system, method, decomposed.notes[0])
+            raise cannot_serve(model, method, decomposed.notes[0])
         loops, chosen_method, notes = decomposed.loops, decomposed.method, decomposed.notes
         packets = max(sum(sum(group.schedule.depths) for group in loop.subsystems) for loop in loops)
         stored_outputs = max(
@@ -192,10 +192,10 @@ def is_large_ring(groups: Sequence[PeerClass], exchange: CommunicationGraph) -> 
     return not common_graph(coupling_terms, exchange)
 
 
-def cannot_serve(system: Model, method: str, reason: str) -> ApcError:
+def cannot_serve(model: Model, method: str, reason: str) -> ApcError:
     """Return the error E850 for a method that is not applicable, with its reason."""
     message = f"method {method} does not apply to this topology: {reason}"
-    return ApcError(Diagnostic("E850", SourceLocation(system.origin.topology), message, fix="--method auto"))
+    return ApcError(Diagnostic("E850", SourceLocation(model.origin.topology), message, fix="--method auto"))
 
 
 def _sizes(loops: Sequence[ModalSystem], method: str) -> tuple[tuple[int, int], ...]:
@@ -217,9 +217,9 @@ def _determinant_memory(loop: ModalSystem) -> int:
     return (CACHE_SIZE_OF_SUBSYSTEM * len(loop.subsystems) + SUBSYSTEM_AT_WORK) * entries
 
 
-def not_populations(system: Model, jacobians: Sequence[SubsystemJacobians]) -> str:
+def not_populations(model: Model, jacobians: Sequence[SubsystemJacobians]) -> str:
     """Return the reason why the method for many different peers is not applicable, "" if it is applicable."""
-    for peer_type, subsystem in zip(system.peer_types, jacobians, strict=True):
+    for peer_type, subsystem in zip(model.peer_types, jacobians, strict=True):
         if subsystem.edges:
             return f"{peer_type.name} depends on individual senders"
         if not subsystem.affine:

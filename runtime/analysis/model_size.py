@@ -60,26 +60,26 @@ class ModelSize(Result):
     pairs: tuple[str, ...]
 
 
-def model_size(system: Model) -> ModelSize:
+def model_size(model: Model) -> ModelSize:
     """Return the numbers of states, ticks and packets in a frame of a model."""
-    with finite_equations(system.origin.topology):
-        return _model_size(system)
+    with finite_equations(model.origin.topology):
+        return _model_size(model)
 
 
-def _model_size(system: Model) -> ModelSize:
+def _model_size(model: Model) -> ModelSize:
     """Return the size of a model; `refused` contains the reason if the model cannot be analysed.
 
     Peer types with ages of several delays are counted with the data of a single delay.
     """
     refused = ""
     try:
-        numeric = numeric_model(system)
+        numeric = numeric_model(model)
     except ApcError as error:  # ages of several delays; a simulation needs no single age
         refused = error.mistakes[0].sentence
-        numeric = NumericModel(system, linear_subsystems(of_single_delay(system)))
+        numeric = NumericModel(model, linear_subsystems(of_single_delay(model)))
     schedule_of = {
         group.peer_type: schedule
-        for group, schedule in reversed(list(zip(system.groups, numeric.schedules, strict=True)))
+        for group, schedule in reversed(list(zip(model.groups, numeric.schedules, strict=True)))
     }
     subsystems = tuple(
         SubsystemSize(
@@ -88,7 +88,7 @@ def _model_size(system: Model) -> ModelSize:
             len(schedule_of[index].discrete_states),
             sum(schedule_of[index].depths),
         )
-        for index, peer_type in enumerate(system.peer_types)
+        for index, peer_type in enumerate(model.peer_types)
     )
     method: str = ""
     systems: tuple[tuple[int, int], ...] = ()
@@ -101,17 +101,17 @@ def _model_size(system: Model) -> ModelSize:
         refused = error.mistakes[0].sentence
     frame = numeric.schedules[0].frame_s
     return ModelSize(
-        system.peers,
+        model.peers,
         frame,
         subsystems,
-        tuple((clock.name, int(frame / numeric.timings[clock.period])) for clock in system.clocks),
+        tuple((clock.name, int(frame / numeric.timings[clock.period])) for clock in model.clocks),
         method,
         systems,
         refused,
         tuple(
             dict.fromkeys(
                 receive.name
-                for peer_type in system.peer_types
+                for peer_type in model.peer_types
                 for partition in peer_type.clocks
                 for receive in partition.receives
                 if edge_name(partition, receive)

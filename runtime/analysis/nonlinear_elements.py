@@ -25,16 +25,16 @@ FLAT = {casadi.OP_FLOOR, casadi.OP_CEIL, casadi.OP_SIGN}
 OF_ALL = "use apc simulate for smaller motions"
 
 
-def replaced_elements(system: Model) -> tuple[str, ...]:
+def replaced_elements(model: Model) -> tuple[str, ...]:
     """Return one sentence for each element that a linear analysis replaces, or whose slope is zero there.
 
     Parameters
     ----------
-    system
+    model
         The compiled model.
     """
     peer_types = [
-        system.peer_types[number] for number in dict.fromkeys(group.peer_type for group in system.groups)
+        model.peer_types[number] for number in dict.fromkeys(group.peer_type for group in model.groups)
     ]
     lines = [
         line

@@ -115,26 +115,26 @@ def sides(numeric: NumericModel) -> tuple[Side, ...]:
         E808 an equation that jumps at the start values, a kink in a sum over several senders, or more than
         MOST_SIDES combinations.
     """
-    system = numeric.model
-    if numeric.starting or all(_has_no_kinks(numeric.jacobians[group.peer_type]) for group in system.groups):
+    model = numeric.model
+    if numeric.starting or all(_has_no_kinks(numeric.jacobians[group.peer_type]) for group in model.groups):
         return (Side("", numeric),)
-    with finite_equations(system.origin.topology), np.errstate(all="ignore"):
-        may_have_kink = [_near_a_kink(numeric, index) for index in range(len(system.groups))]
+    with finite_equations(model.origin.topology), np.errstate(all="ignore"):
+        may_have_kink = [_near_a_kink(numeric, index) for index in range(len(model.groups))]
         if not any(may_have_kink):
             return (Side("", numeric),)
         # Peers of one group may be on different sides.
         origins = [
             index
-            for index, group in enumerate(system.groups)
+            for index, group in enumerate(model.groups)
             for _ in range(group.count if may_have_kink[index] and group.count <= MOST_PEERS else 1)
         ]
-        parts = _divided_groups(system.groups, origins)
+        parts = _divided_groups(model.groups, origins)
         schedules = tuple(numeric.schedules[index] for index in origins)
-        divided = replace(numeric, model=replace(system, groups=parts), given_schedules=schedules)
+        divided = replace(numeric, model=replace(model, groups=parts), given_schedules=schedules)
         try:
             pieces = _pieces_of_groups(divided, [may_have_kink[index] for index in origins])
         except ApcError as error:
-            origin = system.origin
+            origin = model.origin
             raise ApcError(
                 at_part(mistake, origin.topology, origin.texts) for mistake in error.mistakes
             ) from None
@@ -474,14 +474,14 @@ def _side(
     name
         The name of the side.
     """
-    system = numeric.model
+    model = numeric.model
     type_index: dict[tuple[int, _Selection, Moving], int] = {}
     jacobians_of_types: list[SubsystemJacobians] = []
     groups: list[Group] = []
     schedules = []
     previous: tuple[int, int] | None = None
     for group, schedule, origin, piece in zip(
-        system.groups, numeric.schedules, origins, group_pieces, strict=True
+        model.groups, numeric.schedules, origins, group_pieces, strict=True
     ):
         key = group.peer_type, piece.selected, piece.moving
         if key not in type_index:
@@ -501,8 +501,8 @@ def _side(
         groups.append(replace(group, peer_type=peer_type))
         schedules.append(schedule)
         previous = origin, peer_type
-    peer_types = tuple(system.peer_types[peer_type] for peer_type, *_ in type_index)
-    changed = replace(system, peer_types=peer_types, groups=tuple(groups))
+    peer_types = tuple(model.peer_types[peer_type] for peer_type, *_ in type_index)
+    changed = replace(model, peer_types=peer_types, groups=tuple(groups))
     return Side(
         name,
         replace(

@@ -52,13 +52,13 @@ class AnimationFrames:
     others: int
 
 
-def motion_of(system: Model, *, struck: bool) -> AnimationFrames:
+def motion_of(model: Model, *, struck: bool) -> AnimationFrames:
     """Return the simulated motion of a model: from its start values, optionally with an impulse at the
     first peer.
 
     Parameters
     ----------
-    system
+    model
         The model.
     struck
         Whether the first peer's device has an impulse at the start.
@@ -68,11 +68,11 @@ def motion_of(system: Model, *, struck: bool) -> AnimationFrames:
     ApcError
         E983 no device for the impulse, or no position to show; and the errors of `trajectory.simulate`.
     """
-    planar = moves_in_plane(system)
-    views = views_of(system)
+    planar = moves_in_plane(model)
+    views = views_of(model)
     remarks = []
     if struck:
-        system, subject = initial_velocity(system)
+        model, subject = initial_velocity(model)
         remarks.append(impulse_text(subject))
     shown = tuple((view.name, body) for view in views for body in view.bodies)
     indices_of = {(peer, body.name): index for index, (peer, body) in enumerate(shown)}
@@ -90,11 +90,9 @@ def motion_of(system: Model, *, struck: bool) -> AnimationFrames:
         for peer, body in shown
     ]
     if not names:
-        raise ApcError(
-            Diagnostic("E983", SourceLocation(system.name), "the topology has no position to show")
-        )
-    duration = system.experiment.duration or WATCHED
-    simulated = simulate(system, duration=duration, signals=[text for name in names for text in name])
+        raise ApcError(Diagnostic("E983", SourceLocation(model.name), "the topology has no position to show"))
+    duration = model.experiment.duration or WATCHED
+    simulated = simulate(model, duration=duration, signals=[text for name in names for text in name])
     values, time = simulated.values, simulated.time
     indices = [number for number, signal in enumerate(simulated.signals) if signal.unit == "m"]
     distances = np.abs(values - np.nan_to_num(values[0]))  # NaN at absent peers
@@ -128,5 +126,5 @@ def motion_of(system: Model, *, struck: bool) -> AnimationFrames:
             )
         ),
         remarks=tuple(remarks),
-        others=system.peers - len(views),
+        others=model.peers - len(views),
     )

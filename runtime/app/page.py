@@ -129,24 +129,24 @@ whole.toBlob(blob => {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SharedState:
-    """Data common to all tabs: the model, its bytes for the workers, the sliders and the initial settings.
+    """Data common to all tabs: the model, also serialized, the sliders and the initial settings.
 
     `text` is the topology, None if there is only a compiled model.
     """
 
-    system: Model
-    model: bytes
+    model: Model
+    serialized: bytes
     sliders: tuple[Slider, ...]
     settings: tuple[str, ...]
     text: str | None
 
 
-def topology_of(system: Model, settings: Sequence[str], text: str | None) -> SharedState:
+def topology_of(model: Model, settings: Sequence[str], text: str | None) -> SharedState:
     """Return the data common to the tabs of a model.
 
     Parameters
     ----------
-    system
+    model
         The model.
     settings
         Initial settings of sliders, each `NAME=QUANTITY`.
@@ -158,10 +158,10 @@ def topology_of(system: Model, settings: Sequence[str], text: str | None) -> Sha
     ApcError
         E980 a parameter without a slider; and the errors of `overrides.parse_override` and `overrides.apply`.
     """
-    sliders = sliders_of(system)
-    pairs = [set_to(system, sliders, setting) for setting in settings]
-    apply(system, [Override(sliders[index].free, value) for index, value in pairs])
-    return SharedState(system, model_bytes(system), sliders, tuple(settings), text)
+    sliders = sliders_of(model)
+    pairs = [set_to(model, sliders, setting) for setting in settings]
+    apply(model, [Override(sliders[index].free, value) for index, value in pairs])
+    return SharedState(model, model_bytes(model), sliders, tuple(settings), text)
 
 
 def open_page(topology: SharedState, document: Document) -> None:
@@ -174,7 +174,7 @@ class TopologyTab:
 
     def __init__(self, topology: SharedState, document: Document) -> None:
         """Create the sliders, figures and workers of a tab, and request all results."""
-        self.topology, self.system, self.document = topology, topology.system, document
+        self.topology, self.model, self.document = topology, topology.model, document
         self.sliders, self.positions = list(topology.sliders), [slider.start for slider in topology.sliders]
         self.chosen = self._initial_axes()
         self.message = LiveText("message")
@@ -198,7 +198,8 @@ class TopologyTab:
         self.link = ColumnDataSource({"query": [""]})
         self.link.js_on_change("data", CustomJS(args={"link": self.link}, code=LINKED))
         self.workers = [
-            SectionWorker(topology.model, order, self._next_tick, self._deliver) for order in WORKER_SECTIONS
+            SectionWorker(topology.serialized, order, self._next_tick, self._deliver)
+            for order in WORKER_SECTIONS
         ]
         for first in (VERDICT, REGION):
             self.workers[first].precede(self.workers[LATER])
@@ -236,8 +237,8 @@ class TopologyTab:
 
     def _set_initially(self, setting: str) -> None:
         """Set a slider before the page is shown; the value is added to the values of the slider."""
-        index, value = set_to(self.system, self.sliders, setting)
-        apply(self.system, [Override(self.sliders[index].free, value)])
+        index, value = set_to(self.model, self.sliders, setting)
+        apply(self.model, [Override(self.sliders[index].free, value)])
         self.sliders[index], self.positions[index] = with_value(self.sliders[index], value)
 
     def _lay_out(self) -> None:
@@ -251,7 +252,7 @@ class TopologyTab:
         for number, select in enumerate(self.selects):
             self._on_change(select, partial(is_member_of, names), partial(self._choose, number))
         self.region.plot.on_event(Tap, self._on_tap)
-        duration = self.system.experiment.duration
+        duration = self.model.experiment.duration
         self.start_select = Select(
             title="Excitation",
             options=[STRUCK, BEGINS],
@@ -264,7 +265,7 @@ class TopologyTab:
         self.criterion_select = Select(
             title="Stability criterion",
             options=[LIVE, SLOW],
-            value=SLOW if unreliable(self.system) else LIVE,
+            value=SLOW if unreliable(self.model) else LIVE,
             stylesheets=[FOCUS],
         )
         self._on_change(
@@ -278,7 +279,7 @@ class TopologyTab:
             lambda _: self._request_transparency(),
         )
         controls: list[Any] = [self.message.model, *self.selects]
-        if any(link.channel is not None for link in self.system.links):
+        if any(link.channel is not None for link in self.model.links):
             controls.append(self.criterion_select)
         controls.append(row(*self._buttons(), sizing_mode="stretch_width"))
         kinds = dict.fromkeys(slider.kind for slider in self.sliders)
@@ -313,9 +314,9 @@ class TopologyTab:
         self.document.js_on_event(
             "document_ready", CustomJS(args={"sliders": [*self.handles, self.motion.time]}, code=NAMED)
         )
-        self.document.title = f"{self.system.name} · apc"
+        self.document.title = f"{self.model.name} · apc"
         self.document.template = files("apc.app").joinpath("page.html").read_text(encoding="utf-8")
-        self.document.template_variables["description"] = self.system.description
+        self.document.template_variables["description"] = self.model.description
 
     def _buttons(self) -> list[Button]:
         """Return the buttons for the download of the topology, the picture and the numbers."""
@@ -335,7 +336,7 @@ class TopologyTab:
             self.transparency.plot,
             self.transparency.phase,
         ]
-        name = f"{self.system.name}.png"
+        name = f"{self.model.name}.png"
         picture.js_on_event("button_click", CustomJS(args={"plots": plots, "name": name}, code=PICTURED))
         numbers.on_click(self._request_numbers)
         return [topology, picture, numbers]
@@ -349,13 +350,13 @@ class TopologyTab:
             slider.free: slider.texts[index] for slider, index in self._pairs() if index != slider.start
         }
         try:
-            text = with_values(self.topology.text, self.system, values)
+            text = with_values(self.topology.text, self.model, values)
         except ApcError as error:  # the number is in a table of peer values
             self.message.show_text(
                 "The topology cannot be written:", *(item.sentence for item in error.mistakes)
             )
             return
-        self.out.data = {"name": [f"{self.system.name}.yaml"], "text": [text]}
+        self.out.data = {"name": [f"{self.model.name}.yaml"], "text": [text]}
 
     def _request_numbers(self) -> None:
         """Request the numbers for download."""
@@ -367,7 +368,7 @@ class TopologyTab:
 
         The ranges are empty if a study specifies the gains; the result is None without axes.
         """
-        if self.system.tune:
+        if self.model.tune:
             return (), ""
         if (axes := self._region_request()) is None:
             return None
@@ -396,8 +397,8 @@ class TopologyTab:
     def _save_numbers(self, result: Plain) -> None:
         """Download the results as JSON, with the slider values."""
         values = {slider.label: slider.texts[index] for slider, index in self._pairs()}
-        answer = {"topology": self.system.name, "apc": program_version(), "set": values, **result}
-        self.out.data = {"name": [f"{self.system.name}.json"], "text": [json_text(answer)]}
+        answer = {"topology": self.model.name, "apc": program_version(), "set": values, **result}
+        self.out.data = {"name": [f"{self.model.name}.json"], "text": [json_text(answer)]}
 
     @property
     def _overrides(self) -> tuple[Override, ...]:
@@ -528,12 +529,12 @@ class TopologyTab:
         if criterion == MEAN_SQUARE:
             return "mean-square stability"
         if not self.at_once or (
-            not self.linear and any(reaches_start(self.system, interval.free) for interval in (x, y))
+            not self.linear and any(reaches_start(self.model, interval.free) for interval in (x, y))
         ):
             return "a nonlinear topology, linearized at the start for each point"
-        if any(reaches_time(self.system, interval.free) for interval in (x, y)):
+        if any(reaches_time(self.model, interval.free) for interval in (x, y)):
             return "a varied time, with one schedule per point"
-        if any(reaches_count(self.system, interval.free) for interval in (x, y)):
+        if any(reaches_count(self.model, interval.free) for interval in (x, y)):
             return "a varied number of peers, with one analysis per point"
         return ""
 

@@ -163,14 +163,14 @@ def _region(numeric: NumericModel, request: tuple[Range, Range, str]) -> Plain:
 
 def _roots(numeric: NumericModel, request: tuple[ParameterRef, tuple[Fraction, ...]]) -> Plain:
     """Return the root locus: the eigenvalues at values of a slider."""
-    system = numeric.model
+    model = numeric.model
     free, values = request
-    slow = kind_for_parameter(system, free) is not EvaluatorKind.MATRICES
+    slow = kind_for_parameter(model, free) is not EvaluatorKind.MATRICES
     numbers = _thinned(values, FEW_ROOTS if slow else ROOTS)
-    with finite_equations(system.name):
+    with finite_equations(model.name):
         indices, rows = eigenvalues_at(numeric, free, numbers)
     result = np.concatenate([EMPTY, *rows])
-    texts = [text_of(number, unit_of(system, free.name)) for number in numbers]
+    texts = [text_of(number, unit_of(model, free.name)) for number in numbers]
     return {
         "real": result.real,
         "imag": result.imag,
@@ -230,13 +230,13 @@ def _network(numeric: NumericModel, _: None) -> Plain:
     """Return the text of the verdict over the lossy network, and of the critical loss and jitter of
     each link.
     """
-    system = numeric.model
-    links = [link for link in system.links if link.channel is not None]
+    model = numeric.model
+    links = [link for link in model.links if link.channel is not None]
     if not links:
-        name = system.links[0].name if system.links else "lan"
+        name = model.links[0].name if model.links else "lan"
         message = "no link here loses packets or has random delays"
         write = f"Write in the topology: links: {{{name}: {{…, loss: 1 %, jitter: 1 ms}}}}"
-        raise ApcError(Diagnostic("E984", SourceLocation(system.name), f"{message}. {write}"))
+        raise ApcError(Diagnostic("E984", SourceLocation(model.name), f"{message}. {write}"))
     verdict = mean_square_stability(numeric)
     texts = ["Every packet is on time." if verdict is None else str(verdict)]
     for link in links:
@@ -246,14 +246,14 @@ def _network(numeric: NumericModel, _: None) -> Plain:
             for name in (channel.loss and channel.loss.p, channel.jitter)
             if name
         ]
-        texts += [_critical(system, name) for name in dict.fromkeys(names)]
+        texts += [_critical(model, name) for name in dict.fromkeys(names)]
     return {"text": "\n\n".join(texts)}
 
 
-def _critical(system: Model, name: str) -> str:
+def _critical(model: Model, name: str) -> str:
     """Return the text of the critical values of a parameter, or of the reason if there are none."""
     try:
-        return str(critical(system, name, criterion=MEAN_SQUARE))
+        return str(critical(model, name, criterion=MEAN_SQUARE))
     except ApcError as error:
         return f"{name}: {error.mistakes[0].reason}"
 

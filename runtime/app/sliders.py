@@ -78,55 +78,55 @@ class Slider:
         return self.free.label
 
 
-def sliders_of(system: Model) -> tuple[Slider, ...]:
+def sliders_of(model: Model) -> tuple[Slider, ...]:
     """Return the sliders of a model: independent parameters, and each group's number of peers.
 
     Parameters
     ----------
-    system
+    model
         The model, with the initial values of the sliders. The parameters of its studies come first, then
         the stiffnesses and dampings of couplers: the first two are the axes of the region.
     """
-    starts = start_names(system)
+    starts = start_names(model)
     limits: dict[str, float] | None = None  # of stability, computed only for parameters without bounds
-    studied = {axis.parameter: (axis.low, axis.high) for axis in system.region}
+    studied = {axis.parameter: (axis.low, axis.high) for axis in model.region}
     sliders = []
-    for parameter_ref in free_parameters(system):
-        parameter = parameter_of(system, parameter_ref)
+    for parameter_ref in free_parameters(model):
+        parameter = parameter_of(model, parameter_ref)
         if parameter.choices or (parameter_ref.name in starts and parameter.value == 0):
             continue  # named values and start values of zero have no slider
-        low, high = _bounds(system, parameter_ref)
+        low, high = _bounds(model, parameter_ref)
         if low is None and high is None:
-            low = _inherited_minimum(system, parameter_ref)
-            limits = _stability_limits(system) if limits is None else limits
+            low = _inherited_minimum(model, parameter_ref)
+            limits = _stability_limits(model) if limits is None else limits
             if parameter_ref.label in limits and parameter_ref.label not in studied:
                 studied[parameter_ref.label] = (
                     low or Fraction(0),
                     _rounded_up(2 * Fraction(limits[parameter_ref.label])),
                 )
         span = studied.get(parameter_ref.label) or _default_range(
-            system, parameter_ref, parameter.number, low, high
+            model, parameter_ref, parameter.number, low, high
         )
         if parameter.value > 0 and parameter.unit != "1" and parameter_ref.label not in studied:
             values = _logarithmic_values(parameter.number, low, high)
         else:
             values = _linear_values(parameter.number, *_extended(span, parameter.number), low, high)
         sliders.append(
-            _slider(system, parameter_ref, PARAMETERS, parameter.description, values, parameter.number, span)
+            _slider(model, parameter_ref, PARAMETERS, parameter.description, values, parameter.number, span)
         )
-    couplers = coupler_parameters(system)
-    couplers.sort(key=lambda coupler: unit_of(system, coupler.name) not in STIFFNESSES)
+    couplers = coupler_parameters(model)
+    couplers.sort(key=lambda coupler: unit_of(model, coupler.name) not in STIFFNESSES)
     first_labels = [*studied, *(coupler.label for coupler in couplers)]
     sliders.sort(
         key=lambda slider: (
             first_labels.index(slider.label) if slider.label in first_labels else len(first_labels)
         )
     )
-    return (*sliders, *_time_sliders(system, studied), *_peer_count_sliders(system))
+    return (*sliders, *_time_sliders(model, studied), *_peer_count_sliders(model))
 
 
 def _slider(
-    system: Model,
+    model: Model,
     parameter_ref: ParameterRef,
     kind: str,
     description: str,
@@ -135,7 +135,7 @@ def _slider(
     span: tuple[Fraction, Fraction] | None,
 ) -> Slider:
     """Return the slider of a parameter with some values and its present value `now`."""
-    unit = unit_of(system, parameter_ref.name)
+    unit = unit_of(model, parameter_ref.name)
     ascending = tuple(sorted({*values, now}))
     texts = tuple(text_of(number, unit) for number in ascending)
     return Slider(parameter_ref, unit, kind, description, ascending, texts, ascending.index(now), span)
@@ -158,41 +158,41 @@ def _is_float(value: Fraction) -> bool:
     return Fraction(repr(float(value))) == value
 
 
-def _bounds(system: Model, parameter_ref: ParameterRef) -> tuple[Fraction | None, Fraction | None]:
+def _bounds(model: Model, parameter_ref: ParameterRef) -> tuple[Fraction | None, Fraction | None]:
     """Return the smallest and the largest valid value of a parameter, None if unbounded.
 
     At an open bound, the value is slightly above the bound.
     """
-    parameter = parameter_of(system, parameter_ref)
+    parameter = parameter_of(model, parameter_ref)
     low = None if parameter.minimum is None else Fraction(repr(parameter.minimum))
     if low is not None and parameter.exclusive_minimum:
         low += abs(parameter.number - low) / 10**DECADES
     return low, None if parameter.maximum is None else Fraction(repr(parameter.maximum))
 
 
-def _inherited_minimum(system: Model, parameter_ref: ParameterRef) -> Fraction | None:
+def _inherited_minimum(model: Model, parameter_ref: ParameterRef) -> Fraction | None:
     """Return the smallest value of a parameter that the bounds of its dependent parameters permit.
 
     It is None without such a bound, 0, or slightly above 0 where 0 is not permitted.
     """
-    size = abs(parameter_of(system, parameter_ref).number) or Fraction(1)
+    size = abs(parameter_of(model, parameter_ref).number) or Fraction(1)
     for value in (-size, Fraction(0), size / 10**DECADES):
         with suppress(ApcError):
-            apply(system, [Override(parameter_ref, value)])
+            apply(model, [Override(parameter_ref, value)])
             return None if value < 0 else value
     return None
 
 
-def _stability_limits(system: Model) -> dict[str, float]:
+def _stability_limits(model: Model) -> dict[str, float]:
     """Return the parameters whose upper stability limit is found quickly, with the limit."""
     with suppress(ApcError):
-        rows = margins(numeric_model(system), quick=True).rows
+        rows = margins(numeric_model(model), quick=True).rows
         return {row.parameter: row.value for row in rows if row.value is not None and row.value > row.current}
     return {}
 
 
 def _default_range(
-    system: Model, parameter_ref: ParameterRef, now: Fraction, low: Fraction | None, high: Fraction | None
+    model: Model, parameter_ref: ParameterRef, now: Fraction, low: Fraction | None, high: Fraction | None
 ) -> tuple[Fraction, Fraction]:
     """Return a range around a value: between the bounds, or up to `ROOM` times the value, and below 0
     if valid.
@@ -201,8 +201,8 @@ def _default_range(
         return low, high
     same_unit = [
         abs(parameter.number)
-        for parameter in system.parameters
-        if parameter.unit == unit_of(system, parameter_ref.name)
+        for parameter in model.parameters
+        if parameter.unit == unit_of(model, parameter_ref.name)
     ]
     size = abs(now) or max(same_unit, default=Fraction(0)) or Fraction(1)
     least = -ROOM * size if low is None else low
@@ -249,14 +249,14 @@ def _logarithmic_values(now: Fraction, low: Fraction | None, high: Fraction | No
     ]
 
 
-def _time_sliders(system: Model, studied: dict[str, tuple[Fraction, Fraction]]) -> list[Slider]:
+def _time_sliders(model: Model, studied: dict[str, tuple[Fraction, Fraction]]) -> list[Slider]:
     """Return the sliders of delays, phases and periods without formula."""
-    periods = {clock.period: clock for clock in system.clocks}
-    phases = {clock.phase: clock for clock in system.clocks}
-    now = {timing.name: timing.value for timing in system.timings}
+    periods = {clock.period: clock for clock in model.clocks}
+    phases = {clock.phase: clock for clock in model.clocks}
+    now = {timing.name: timing.value for timing in model.timings}
     longest = max((now[name] for name in periods), default=Fraction(1))
     sliders = []
-    for timing in named_times(system):
+    for timing in named_times(model):
         parameter_ref, value = ParameterRef(timing.name), timing.value
         if timing.formula is not None:
             continue
@@ -270,19 +270,19 @@ def _time_sliders(system: Model, studied: dict[str, tuple[Fraction, Fraction]]) 
             period = now[phases[timing.name].period]
             description, values = "of the first tick", [period * k / 20 for k in range(20)]
         else:
-            description = _time_description(system, timing.name)
+            description = _time_description(model, timing.name)
             span = studied.get(timing.name, (Fraction(0), _rounded_up(max(ROOM * value, 4 * longest))))
             values = _linear_values(value, *_extended(span, value), Fraction(0), None)
-        sliders.append(_slider(system, parameter_ref, TIMES, description, values, value, span))
+        sliders.append(_slider(model, parameter_ref, TIMES, description, values, value, span))
     return sorted(sliders, key=lambda slider: (slider.span is None, slider.free.name in phases))
 
 
-def _time_description(system: Model, name: str) -> str:
+def _time_description(model: Model, name: str) -> str:
     """Return the description of a time."""
     description = next(
-        (parameter.description for parameter in system.parameters if parameter.name == name), ""
+        (parameter.description for parameter in model.parameters if parameter.name == name), ""
     )
-    return f"{description}, of all groups" if len(times_of(system, name)) > 1 else description
+    return f"{description}, of all groups" if len(times_of(model, name)) > 1 else description
 
 
 def _periods(now: Fraction, others: Sequence[Fraction]) -> list[Fraction]:
@@ -304,21 +304,21 @@ def _frame(periods: Sequence[Fraction]) -> Fraction:
     return Fraction(lcm(*(int(period * denominator) for period in periods)), denominator)
 
 
-def _peer_count_sliders(system: Model) -> list[Slider]:
+def _peer_count_sliders(model: Model) -> list[Slider]:
     """Return the sliders of the numbers of peers, of groups without individual values for each peer."""
     sliders = []
-    for group in system.groups:
+    for group in model.groups:
         parameter_ref = ParameterRef(group_count(group.name))
-        parameter = parameter_of(system, parameter_ref)
+        parameter = parameter_of(model, parameter_ref)
         if group.columns or parameter.formula is not None:
             continue
-        least = 2 if len(system.groups) == 1 else 1
+        least = 2 if len(model.groups) == 1 else 1
         most = COUNTS * max(group.count, 3)
         values = [Fraction(k) for k in range(least, most + 1)]
         span = (Fraction(least), Fraction(most))
         description = f"how many peers {group.name} has"
         sliders.append(
-            _slider(system, parameter_ref, PEER_COUNTS, description, values, Fraction(group.count), span)
+            _slider(model, parameter_ref, PEER_COUNTS, description, values, Fraction(group.count), span)
         )
     return sliders
 
@@ -346,7 +346,7 @@ def position_of(slider: Slider, value: Fraction | float) -> int:
     return min(indices, key=lambda index: abs(slider.values[index] - Fraction(value)))
 
 
-def set_to(system: Model, sliders: Sequence[Slider], text: str) -> tuple[int, Fraction]:
+def set_to(model: Model, sliders: Sequence[Slider], text: str) -> tuple[int, Fraction]:
     """Return the index of the slider for a setting `NAME=QUANTITY`, and the value.
 
     Raises
@@ -354,7 +354,7 @@ def set_to(system: Model, sliders: Sequence[Slider], text: str) -> tuple[int, Fr
     ApcError
         E980 the parameter has no slider; and the errors of `overrides.parse_override`.
     """
-    override = parse_override(system, text)
+    override = parse_override(model, text)
     for index, slider in enumerate(sliders):
         if slider.free == override.free:
             return index, override.value

@@ -41,14 +41,14 @@ _PLAIN = re.compile(r"(?:[\w.(][\w .+*/^%()@-]*[\w.)%]|[\w.])?\Z|[-+][\w.(][\w .
 _BLOCK_COMMENT = re.compile(r"[|>][-+0-9]*([ \t]+#[^\r\n]*)")
 
 
-def write_topology(path: Path, text: str, system: Model, values: Mapping[ParameterRef, str]) -> None:
+def write_topology(path: Path, text: str, model: Model, values: Mapping[ParameterRef, str]) -> None:
     """Write a topology with other values to a file, after checking that the text compiles to these values.
 
     Parameters
     ----------
     path
         The file to write; files named by the topology are read from its folder.
-    text, system, values
+    text, model, values
         As for `with_values`.
 
     Raises
@@ -56,25 +56,25 @@ def write_topology(path: Path, text: str, system: Model, values: Mapping[Paramet
     ApcError
         E601 the file can't be written, E997 the text would have other values; and the errors of the compiler.
     """
-    changed = _edited_text(text, system, values)
+    changed = _edited_text(text, model, values)
     *_, (_, compiled) = stages_of(parse_source(changed.encode(), file=str(path), path=path))
     assert isinstance(compiled, Model)
     check_values(compiled)
-    expected = _check(compiled, system, values, SourceLocation(str(path)))
+    expected = _check(compiled, model, values, SourceLocation(str(path)))
     verdicts = [analyze(numeric_model(item)).verdict for item in (expected, compiled)]
     if verdicts[0] != verdicts[1]:
         raise ApcError(Diagnostic("E997", SourceLocation(str(path)), "topology written", *verdicts))
     write_text(path, changed.removesuffix("\n"))
 
 
-def with_values(text: str, system: Model, values: Mapping[ParameterRef, str]) -> str:
+def with_values(text: str, model: Model, values: Mapping[ParameterRef, str]) -> str:
     """Return the text of a topology with other values.
 
     Parameters
     ----------
     text
         The text of a valid topology.
-    system
+    model
         The model of the topology.
     values
         The new quantities, by parameter.
@@ -84,23 +84,23 @@ def with_values(text: str, system: Model, values: Mapping[ParameterRef, str]) ->
     ApcError
         E997 the text would have other values.
     """
-    changed = _edited_text(text, system, values)
-    name = system.origin.topology
-    texts = tuple((key, changed.encode() if key == name else old) for key, old in system.origin.texts)
-    compiled = compile_again(replace(system.origin, texts=texts, changes=()), Path())
-    _check(compiled, system, values, SourceLocation(name))
+    changed = _edited_text(text, model, values)
+    name = model.origin.topology
+    texts = tuple((key, changed.encode() if key == name else old) for key, old in model.origin.texts)
+    compiled = compile_again(replace(model.origin, texts=texts, changes=()), Path())
+    _check(compiled, model, values, SourceLocation(name))
     return changed
 
 
-def _edited_text(text: str, system: Model, values: Mapping[ParameterRef, str]) -> str:
+def _edited_text(text: str, model: Model, values: Mapping[ParameterRef, str]) -> str:
     """Return the text with the new values at their paths, without a check of the result."""
     text = text.removeprefix("\ufeff")
-    groups = {group.name: group.count for group in system.groups}
+    groups = {group.name: group.count for group in model.groups}
     # Values of all groups are written before values of single groups.
     for parameter_ref, value in sorted(
         values.items(), key=lambda pair: pair[0].label.partition(".")[0] in groups
     ):
-        for path in _paths(_tree(text), system, parameter_ref):
+        for path in _paths(_tree(text), model, parameter_ref):
             root = _tree(text)
             count = (*path[:2], "count")
             is_list = path[0] == "peers" and path[2] == "set" and isinstance(_node_at(root, path), _List)
@@ -114,16 +114,16 @@ def _edited_text(text: str, system: Model, values: Mapping[ParameterRef, str]) -
 
 
 def _check(
-    written: Model, system: Model, values: Mapping[ParameterRef, str], location: SourceLocation
+    written: Model, model: Model, values: Mapping[ParameterRef, str], location: SourceLocation
 ) -> Model:
     """Return the model with the new values. Raises E997 if the compiled text has another number.
 
-    `written` is the model compiled from the text, `system` the model before the change.
+    `written` is the model compiled from the text, `model` the model before the change.
     """
     overrides = [
-        parse_override(system, f"{parameter_ref.label}={value}") for parameter_ref, value in values.items()
+        parse_override(model, f"{parameter_ref.label}={value}") for parameter_ref, value in values.items()
     ]
-    result = apply(system, overrides)
+    result = apply(model, overrides)
     expected_numbers, actual = _numbers(result), _numbers(written)
     for name in dict.fromkeys((*expected_numbers, *actual)):
         if expected_numbers.get(name) != actual.get(name):
@@ -143,21 +143,21 @@ def _shown(number: Any) -> str:
     return "none" if number is None else f"{float(number):.12g}"
 
 
-def _numbers(system: Model) -> dict[str, Any]:
+def _numbers(model: Model) -> dict[str, Any]:
     """Return every exact number of a model by name and group, as a tuple if it differs between peers."""
     # The name of a single loss probability changes if another number of the loss model is given.
-    losses = [channel.loss for link in system.links for channel in link.channels]
+    losses = [channel.loss for link in model.links for channel in link.channels]
     lost = {
         getattr(loss, item.name): f"{loss.r.removesuffix('.r')} {item.name}"
         for loss in losses
         if loss is not None
         for item in fields(loss)
     }
-    result: dict[str, Any] = {timing.name: timing.value for timing in system.timings}
-    for group in system.groups:
+    result: dict[str, Any] = {timing.name: timing.value for timing in model.timings}
+    for group in model.groups:
         result[f"number of peers of {group.name}"] = group.count
-        scalars = {parameter.name: parameter.number for parameter in (*system.parameters, *group.values)}
-        columns = {name: tuple(column.tolist()) for name, column in columns_of(system, group).items()}
+        scalars = {parameter.name: parameter.number for parameter in (*model.parameters, *group.values)}
+        columns = {name: tuple(column.tolist()) for name, column in columns_of(model, group).items()}
         result |= {
             f"{group.name}.{lost.get(name, name)}": number for name, number in (scalars | columns).items()
         }
@@ -167,9 +167,9 @@ def _numbers(system: Model) -> dict[str, Any]:
 # ---- paths of numbers ----
 
 
-def _paths(root: _Node, system: Model, parameter_ref: ParameterRef) -> list[Sequence[str]]:
+def _paths(root: _Node, model: Model, parameter_ref: ParameterRef) -> list[Sequence[str]]:
     """Return the paths of keys at which a parameter is written, or is to be inserted."""
-    groups = [group.name for group in system.groups]
+    groups = [group.name for group in model.groups]
     if parameter_ref.group is not None:
         return [_in_set(root, parameter_ref.group, parameter_ref.name)]
     first, _, local_name = parameter_ref.name.partition(".")
@@ -180,7 +180,7 @@ def _paths(root: _Node, system: Model, parameter_ref: ParameterRef) -> list[Sequ
     if first in groups:  # a delay set by one group
         return [_in_set(root, first, local_name)]
     if any(
-        clock.name == first and parameter_ref.name in (clock.period, clock.phase) for clock in system.clocks
+        clock.name == first and parameter_ref.name in (clock.period, clock.phase) for clock in model.clocks
     ):
         clock = _node_at(root, ("clocks", first))
         return [
@@ -190,7 +190,7 @@ def _paths(root: _Node, system: Model, parameter_ref: ParameterRef) -> list[Sequ
         ]
     group_paths = [
         _in_set(root, group.name, parameter_ref.name)
-        for group in system.groups
+        for group in model.groups
         if parameter_ref.name
         in {*(value.name for value in group.values), *(column.name for column in group.columns)}
     ]
@@ -209,8 +209,8 @@ def _paths(root: _Node, system: Model, parameter_ref: ParameterRef) -> list[Sequ
             return [(section, first, *local_name.split("."))]
     groups_with_part = [
         group.name
-        for group in system.groups
-        if parameter_ref.name in system.peer_types[group.peer_type].parameters
+        for group in model.groups
+        if parameter_ref.name in model.peer_types[group.peer_type].parameters
     ]
     return [_in_set(root, group, parameter_ref.name) for group in groups_with_part or groups]
 

@@ -115,10 +115,10 @@ def run_hard_cases(
         if path.stem not in truths:
             without.append(path.name)
             continue
-        system = compile_topology(path)
+        model = compile_topology(path)
         with single_threaded():
-            seconds, result = median_time(partial(solve, system), repeats, enough=ENOUGH)
-        cases.append(compare(system, result, truths[path.stem], seconds, path.stem))
+            seconds, result = median_time(partial(solve, model), repeats, enough=ENOUGH)
+        cases.append(compare(model, result, truths[path.stem], seconds, path.stem))
     if not cases:
         message = "has no topology with a reference result"
         raise ApcError(Diagnostic("E920", SourceLocation(str(folder)), message, fix=FOLDER))
@@ -126,13 +126,13 @@ def run_hard_cases(
 
 
 def compare(
-    system: Model, analysis: Analysis, truth: Mapping[str, Any], seconds: float, name: str
+    model: Model, analysis: Analysis, truth: Mapping[str, Any], seconds: float, name: str
 ) -> HardCase:
     """Return the comparison of an analysis with its reference.
 
     Parameters
     ----------
-    system, analysis
+    model, analysis
         The topology and its analysis.
     truth
         An entry of `truths.json`.
@@ -162,8 +162,8 @@ def compare(
         failures.append(f"{truth['rigid_modes']} rigid modes, not {analysis.rigid_modes}")
     return HardCase(
         name=name,
-        description=system.description,
-        peers=system.peers,
+        description=model.description,
+        peers=model.peers,
         method=analysis.method + (" + proof" if analysis.proof else ""),
         verdict=analysis.verdict,
         radius=str(truth["spectral_radius"]),

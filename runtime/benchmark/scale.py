@@ -120,9 +120,9 @@ def with_count(path: Path, count: int) -> Model:
         line[: location.column - 1] + str(count) + line[location.column - 1 + len(number.text) :]
     )
     changed = parse_source("".join(lines).encode(), file=source.file, path=source.path)
-    *_, (_, system) = stages_of(changed)
-    assert isinstance(system, Model)
-    return system
+    *_, (_, model) = stages_of(changed)
+    assert isinstance(model, Model)
+    return model
 
 
 def _largest(path: Path) -> tuple[str, Scalar]:
@@ -153,15 +153,15 @@ def _measure_in_process(measure: Callable[[Path, int], Measured], path: Path, co
 
 def _measure(path: Path, count: int) -> ScaleRow:
     """Return the measurement of compilation and analysis for one number of peers, in this process."""
-    compiled, system = timed(partial(with_count, path, count))
-    analyzed, result = median_time(partial(analysis_of, system), REPEATS)
+    compiled, model = timed(partial(with_count, path, count))
+    analyzed, result = median_time(partial(analysis_of, model), REPEATS)
     memory = _memory()
     error = None
     with suppress(NotSupportedError):
-        error = spectral_truth(system).error_of(result.spectral_radius)
+        error = spectral_truth(model).error_of(result.spectral_radius)
     return ScaleRow(
         count=count,
-        peers=system.peers,
+        peers=model.peers,
         compile_s=compiled,
         analyze_s=analyzed,
         memory=memory,

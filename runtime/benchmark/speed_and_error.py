@@ -143,12 +143,12 @@ class Bench(Result):
         return tuple(fault for comparison in self.comparisons for fault in comparison.faults)
 
 
-def bench(system: Model, *, rounds: int = ROUNDS, duration: Fraction = DURATION) -> Bench:
+def bench(model: Model, *, rounds: int = ROUNDS, duration: Fraction = DURATION) -> Bench:
     """Return the measurements of every method of analysis and simulation on a topology.
 
     Parameters
     ----------
-    system
+    model
         The model, with the parameter values to use.
     rounds
         The number of runs of each method, fewer for slow methods.
@@ -161,14 +161,14 @@ def bench(system: Model, *, rounds: int = ROUNDS, duration: Fraction = DURATION)
         No method can analyze the topology.
     """
     with single_threaded():
-        analysis = bench_analysis(system, rounds=rounds)
+        analysis = bench_analysis(model, rounds=rounds)
         try:
-            simulation = bench_simulation(system, duration, rounds=rounds)
+            simulation = bench_simulation(model, duration, rounds=rounds)
         except ApcError as error:  # a model that is too large for simulation can still be analyzed
             simulation = _simulation_comparison(
                 duration, (), "no simulation", (("every method", reason_of(error)),)
             )
-    return Bench(system.name, system.peers, machine(), (analysis, simulation))
+    return Bench(model.name, model.peers, machine(), (analysis, simulation))
 
 
 def reason_of(error: ApcError) -> str:
@@ -198,30 +198,30 @@ def _processor() -> str:
         return platform.processor()
 
 
-def analysis_of(system: Model, *, method: str = AUTO, certify: bool = False) -> Analysis:
+def analysis_of(model: Model, *, method: str = AUTO, certify: bool = False) -> Analysis:
     """Return the analysis of a model, with its Jacobians and schedules; parameters as for `analyze`."""
-    return analyze(numeric_model(system), method=method, certify=certify)
+    return analyze(numeric_model(model), method=method, certify=certify)
 
 
-def bench_analysis(system: Model, *, rounds: int = ROUNDS) -> TaskComparison:
+def bench_analysis(model: Model, *, rounds: int = ROUNDS) -> TaskComparison:
     """Return the measurements of every method of analysis, from the compiled topology to the verdict.
 
     The error is that of the spectral radius without rigid modes.
     """
     calls: dict[str, Callable[[], Analysis]] = {
-        name: partial(analysis_of, system, method=name) for name in ANALYSES if name not in (CERTIFIED, PAPER)
+        name: partial(analysis_of, model, method=name) for name in ANALYSES if name not in (CERTIFIED, PAPER)
     }
-    calls[CERTIFIED] = partial(analysis_of, system, certify=True)
+    calls[CERTIFIED] = partial(analysis_of, model, certify=True)
     if paper_method := find_extension("paper_method"):
-        calls[PAPER] = partial(paper_method.analyze_paper, system)
-    default = analysis_of(system)
+        calls[PAPER] = partial(paper_method.analyze_paper, model)
+    default = analysis_of(model)
     limitations = []
     truth, text = (
         None,
         "the same equations in 512-bit ball arithmetic, with parameters as doubles: spectral radius",
     )
     try:
-        truth = spectral_truth(system)
+        truth = spectral_truth(model)
         text = f"{text} {truth.digits}"
     except NotSupportedError as why:
         text = str(why)
@@ -273,26 +273,26 @@ def _not_proved(analysis: Analysis) -> str:
     return "; ".join(reasons) or f"not proved: {analysis.proof}"
 
 
-def bench_simulation(system: Model, duration: Fraction = DURATION, *, rounds: int = ROUNDS) -> TaskComparison:
+def bench_simulation(model: Model, duration: Fraction = DURATION, *, rounds: int = ROUNDS) -> TaskComparison:
     """Return the measurements of every method of simulation, from the first instant to the last.
 
     The error is the largest distance of all continuous states at all ticks from the exact transition,
     relative to the largest value of all states with the same unit. The error of the exact transition is its
     change if every coefficient is changed by one rounding (see `accuracy`).
     """
-    refuse_joins_and_leaves(system, "apc bench")
+    refuse_joins_and_leaves(model, "apc bench")
     notes = []
-    if _is_at_rest(system, duration):
-        system, how = _with_displaced_start(system)
+    if _is_at_rest(model, duration):
+        model, how = _with_displaced_start(model)
         notes.append(f"this topology is at rest: {how}")
     calls = {
-        str(method): partial(_prepared_simulation, system, duration, method) for method in _methods(system)
+        str(method): partial(_prepared_simulation, model, duration, method) for method in _methods(model)
     }
     simulations, refused, _ = _first_results(calls)
     times = alternate(
         {name: partial(_simulate, item) for name, item in simulations.items()}, rounds, enough=ENOUGH
     )
-    chosen = prepare(system, Settings(duration)).how
+    chosen = prepare(model, Settings(duration)).how
     exact = simulations.get(EXACT)
     rounded, _ = finer(Method(EXACT), all_linear=True)
     measured = [
@@ -300,7 +300,7 @@ def bench_simulation(system: Model, duration: Fraction = DURATION, *, rounds: in
             name,
             times[name],
             error=exact
-            and _distance(_prepared_simulation(system, duration, rounded) if item is exact else item, exact),
+            and _distance(_prepared_simulation(model, duration, rounded) if item is exact else item, exact),
             bound=None,
             chosen=name == chosen or (name == str(DEFAULT) and chosen != EXACT),
         )
@@ -331,10 +331,10 @@ def _simulation_comparison(
     )
 
 
-def _methods(system: Model) -> list[Method]:
+def _methods(model: Model) -> list[Method]:
     """Return the simulation methods to compare, with steps that divide the period of the fastest clock."""
-    seconds = resolve(system).timings
-    tick = min((seconds[clock.period] for clock in system.clocks), default=Fraction(1, 1000))
+    seconds = resolve(model).timings
+    tick = min((seconds[clock.period] for clock in model.clocks), default=Fraction(1, 1000))
     return [
         Method(EXACT),
         *(Method(RK4, step=tick / parts) for parts in (1, 4, 16)),
@@ -343,46 +343,46 @@ def _methods(system: Model) -> list[Method]:
     ]
 
 
-def _is_at_rest(system: Model, duration: Fraction) -> bool:
+def _is_at_rest(model: Model, duration: Fraction) -> bool:
     """Return whether no continuous state changes during a simulation."""
-    names = tuple(dict.fromkeys(state.name for peer_type in system.peer_types for state in peer_type.states))
+    names = tuple(dict.fromkeys(state.name for peer_type in model.peer_types for state in peer_type.states))
     if not names:
         return False
     first: Floats | None = None
-    for block in blocks(prepare(system, Settings(duration), signals=names)):
+    for block in blocks(prepare(model, Settings(duration), signals=names)):
         first = block.values[0] if first is None else first
         if block.stopped or np.any(block.values != first):
             return False
     return True
 
 
-def _with_displaced_start(system: Model) -> tuple[Model, str]:
+def _with_displaced_start(model: Model) -> tuple[Model, str]:
     """Return the model with the first state of the first peer displaced at the start, and a text that
     describes this.
 
     The displacement is the scale of the state.
     """
-    first, *others = system.groups
-    peer_type, numbers = system.peer_types[first.peer_type], resolve(system)
+    first, *others = model.groups
+    peer_type, numbers = model.peer_types[first.peer_type], resolve(model)
     state = peer_type.states[0]
     rows = numbers.parameters[0]
-    by = float(state_scales(system, peer_type, jacobians(peer_type), list(rows))[0])
+    by = float(state_scales(model, peer_type, jacobians(peer_type), list(rows))[0])
     values = np.array(rows[numbers.rows[0], peer_type.parameters.index(state.start)], dtype=np.float64)
     values[0] += by
     columns = (
         *(column for column in first.columns if column.name != state.start),
         PeerColumn(state.start, values),
     )
-    changed = replace(system, groups=(replace(first, columns=columns), *others))
+    changed = replace(model, groups=(replace(first, columns=columns), *others))
     return (
         changed,
         f"the initial {state.name} of the first peer is displaced by {with_unit(f'{by:g}', state.unit)}",
     )
 
 
-def _prepared_simulation(system: Model, duration: Fraction, method: Method) -> Simulation:
+def _prepared_simulation(model: Model, duration: Fraction, method: Method) -> Simulation:
     """Return the prepared simulation by one method."""
-    return prepare(system, Settings(duration, method))
+    return prepare(model, Settings(duration, method))
 
 
 def _simulate(simulation: Simulation) -> None:
@@ -396,7 +396,7 @@ def _distance(simulation: Simulation, exact: Simulation) -> float:
 
     The distance is relative to the largest value of all states with the same unit in the exact simulation.
     """
-    names = {state.name for peer_type in simulation.system.peer_types for state in peer_type.states}
+    names = {state.name for peer_type in simulation.model.peer_types for state in peer_type.states}
     state_columns = [index for index, signal in enumerate(exact.signals) if signal.local in names]
     rows = (row for block in blocks(simulation) for row in block.values)
     largest_difference, largest_value = np.zeros(len(state_columns)), np.zeros(len(state_columns))

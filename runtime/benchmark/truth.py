@@ -59,7 +59,7 @@ class Truth:
         return float(abs(Fraction(radius) - Fraction(self.digits)))
 
 
-def spectral_truth(system: Model) -> Truth:
+def spectral_truth(model: Model) -> Truth:
     """Return the spectral radius of one frame of a topology to fifty digits.
 
     Raises
@@ -69,7 +69,7 @@ def spectral_truth(system: Model) -> Truth:
     NotSupportedError
         There is no reference; the text is the reason.
     """
-    systems = [close_loop(loop) for loop in _loops(system)]
+    systems = [close_loop(loop) for loop in _loops(model)]
     if reason := next(filter(None, map(unprovable, systems)), ""):
         raise NotSupportedError(reason)
     previous = None
@@ -82,21 +82,21 @@ def spectral_truth(system: Model) -> Truth:
     raise NotSupportedError(f"{DIGITS} digits are not reached with {PRECISIONS[-1]} bits")
 
 
-def _loops(system: Model) -> Sequence[ModalSystem]:
+def _loops(model: Model) -> Sequence[ModalSystem]:
     """Return the systems into which a topology is decomposed, with exact weights.
 
     Raises NotSupportedError for a topology that is too large.
     """
-    numbers = resolve(system)
+    numbers = resolve(model)
     moving = sum(
-        len(rows) * len(system.peer_types[group.peer_type].states)
-        for rows, group in zip(numbers.parameters, system.groups, strict=True)
+        len(rows) * len(model.peer_types[group.peer_type].states)
+        for rows, group in zip(numbers.parameters, model.groups, strict=True)
     )
     if moving > BALL_STATES:
         raise NotSupportedError(f"{moving:,} states of different peers {TOO_LONG}")
-    if system.peers > BALL_STATES and any(link.graph.shape not in SPLIT for link in system.links):
-        raise NotSupportedError(f"{system.peers:,} peers on a graph {TOO_LONG}")
-    groups, exchange = lifted_classes(numeric_model(system))
+    if model.peers > BALL_STATES and any(link.graph.shape not in SPLIT for link in model.links):
+        raise NotSupportedError(f"{model.peers:,} peers on a graph {TOO_LONG}")
+    groups, exchange = lifted_classes(numeric_model(model))
     loops = decompose(groups, exchange).loops
     if any(
         weight_error and coupling_term not in loop.surds

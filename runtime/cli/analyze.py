@@ -93,7 +93,7 @@ def analyze_command(
         given |= {"--hands passive": hands == PASSIVE, "--operating-point": operating_point != "start"}
         if refused := [name for name, is_given in given.items() if is_given]:
             raise click.UsageError(f"--changing can't be combined with {', '.join(refused)}")
-    system = open_topology(
+    model = open_topology(
         file,
         settings,
         {"--plot": plot},
@@ -110,18 +110,18 @@ def analyze_command(
         }
         requested |= {"--margins": bool(margins), "--plot": plot is not None}
         refused = [name for name, given in requested.items() if given]
-        _absolute_stability(system, refused, box, certify=certify, as_json=as_json)
+        _absolute_stability(model, refused, box, certify=certify, as_json=as_json)
         return
     if hands not in HANDS:  # one of the library: all that were measured
         box = (*box, *(f"{name}={low}:{high}" for name, (low, high, _) in published(hands).items()))
     if changing:
-        print_result(_changing_counts(system, *changing), as_json=as_json)
+        print_result(_changing_counts(model, *changing), as_json=as_json)
         return
-    ranges = _ranges(system, box)
-    listed = sum(group.count for group in system.groups if group.columns)
-    with at_work(f"analyzing {system.peers:,} peers", about=SECONDS_A_PEER * listed):
+    ranges = _ranges(model, box)
+    listed = sum(group.count for group in model.groups if group.columns)
+    with at_work(f"analyzing {model.peers:,} peers", about=SECONDS_A_PEER * listed):
         result = answer(
-            system,
+            model,
             method=method,
             certify=certify,
             box=ranges,
@@ -138,27 +138,27 @@ def analyze_command(
     print_result(result, as_json=as_json, written=[plot])
 
 
-def _changing_counts(system: Model, changing: str) -> Result:
+def _changing_counts(model: Model, changing: str) -> Result:
     """Return the stability while the number of peers changes."""
     from apc.lifting.numeric_model import numeric_model
     from apc.network.nominal_criterion import unreliable
     from apc.support.extension_table import require_extension
 
-    extension, lossy = require_extension("changing_counts"), bool(unreliable(system))
-    result: Result = extension.changing_counts(numeric_model(system), changing, lossy=lossy)
+    extension, lossy = require_extension("changing_counts"), bool(unreliable(model))
+    result: Result = extension.changing_counts(numeric_model(model), changing, lossy=lossy)
     return result
 
 
-def _ranges(system: Model, box: tuple[str, ...]) -> list[Range]:
+def _ranges(model: Model, box: tuple[str, ...]) -> list[Range]:
     """Return the ranges of --box and those of the topology."""
     from apc.parameter_values.parameter_names import given_ranges
     from apc.studies.parameter_ranges import parse_range
 
-    return given_ranges(system, [parse_range(system, text, SourceLocation("--box")) for text in box])
+    return given_ranges(model, [parse_range(model, text, SourceLocation("--box")) for text in box])
 
 
 def _absolute_stability(
-    system: Model, requested: list[str], box: tuple[str, ...], *, certify: bool, as_json: bool
+    model: Model, requested: list[str], box: tuple[str, ...], *, certify: bool, as_json: bool
 ) -> None:
     """Print the absolute stability, also for ranges of delays. Raises ApcError E930 for other options."""
     from apc.haptics.absolute_stability import absolute_stability
@@ -168,9 +168,9 @@ def _absolute_stability(
         verb = "is" if len(requested) == 1 else "are"
         message = f"{' and '.join(requested)} {verb} not available with --hands passive"
         raise ApcError(Diagnostic("E930", SourceLocation("--hands"), message, fix="--hands clamped"))
-    if ranges := _ranges(system, box):
+    if ranges := _ranges(model, box):
         from apc.analysis_report import robust_stability
 
-        print_result(robust_stability(system, ranges, passive=True), as_json=as_json)
+        print_result(robust_stability(model, ranges, passive=True), as_json=as_json)
         return
-    print_result(absolute_stability(numeric_model(system), certify=certify), as_json=as_json)
+    print_result(absolute_stability(numeric_model(model), certify=certify), as_json=as_json)

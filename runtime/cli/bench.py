@@ -61,9 +61,9 @@ def bench_command(
         return
     from apc.benchmark.speed_and_error import bench
 
-    system = open_topology(file, settings, {"--plot": plot}, notify=note_aside)
+    model = open_topology(file, settings, {"--plot": plot}, notify=note_aside)
     with at_work("measuring"):
-        result = bench(system)
+        result = bench(model)
     print_result(result, as_json=as_json)
     if plot is not None:  # after the result, which may take minutes, is printed
         from apc.output.bench_output import bench_picture

@@ -63,14 +63,14 @@ def compare_command(
     systems, refused = [], {}
     for index, file in enumerate(files):
         try:
-            system = open_topology(file, settings, {"--out": out}, hands=hands, notify=note_aside)
+            model = open_topology(file, settings, {"--out": out}, hands=hands, notify=note_aside)
         except ApcError as error:
             if error.mistakes[0].code not in UNHELD:
                 raise
             others = [text for text in settings if not names_hand(text)]
-            system = open_topology(file, others, {"--out": out})
+            model = open_topology(file, others, {"--out": out})
             refused[index] = error.mistakes[0].reason
-        systems.append(system)
+        systems.append(model)
     with status_line() as progress:
         comparison = compare(
             systems, over=over, criterion=requested, at=at, refused=refused, progress=progress

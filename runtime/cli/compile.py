@@ -39,14 +39,14 @@ def check_command(
     if text := check_definition(path):
         echo(f"{path}: no errors ({text})")
         return
-    system = compile_topology(path)
-    check_values(system)
-    if system.experiment.joins or system.experiment.leaves:
+    model = compile_topology(path)
+    check_values(model)
+    if model.experiment.joins or model.experiment.leaves:
         from apc.simulation.simulation import check_joins_and_leaves
 
-        check_joins_and_leaves(system)
-    echo(f"{path}: no errors ({system.name}, {counted(system.peers, 'peer')})")
-    for line in warning_lines((*system.warnings, *replaced_elements(system))):
+        check_joins_and_leaves(model)
+    echo(f"{path}: no errors ({model.name}, {counted(model.peers, 'peer')})")
+    for line in warning_lines((*model.warnings, *replaced_elements(model))):
         echo(line)
 
 
@@ -103,7 +103,7 @@ def _compile(path: Path) -> None:
     from apc.lifting.start_checks import check_values
     from apc.output.analysis_output import compile_text
 
-    system = compile_topology(path)
-    check_values(system)
-    save(system, target := path.with_suffix(".apc"), compiled=True)
-    echo("\n".join(compile_text(system, model_size(system), target)))
+    model = compile_topology(path)
+    check_values(model)
+    save(model, target := path.with_suffix(".apc"), compiled=True)
+    echo("\n".join(compile_text(model, model_size(model), target)))

@@ -70,7 +70,7 @@ def critical_command(
     if plot is not None and requested == "passive":
         message = "--plot is not available with --hands passive, which computes no eigenvalues"
         raise ApcError(Diagnostic("E930", SourceLocation("--hands"), message, fix="--hands clamped"))
-    system = open_topology(
+    model = open_topology(
         file,
         settings,
         {"--plot": plot},
@@ -79,14 +79,14 @@ def critical_command(
         varied=(path, *over),
         notify=note_aside,
     )
-    refuse_choices(system, find(system, path, COMMAND, counts=True), COMMAND)
+    refuse_choices(model, find(model, path, COMMAND, counts=True), COMMAND)
     if over:
         if plot is not None:
             raise click.UsageError("--plot can't be combined with --over")
-        print_result(_over(system, path, (lower, upper), over, requested), as_json=as_json)
+        print_result(_over(model, path, (lower, upper), over, requested), as_json=as_json)
         return
     with status_line() as progress:
-        result = critical(system, path, lower=lower, upper=upper, criterion=requested, progress=progress)
+        result = critical(model, path, lower=lower, upper=upper, criterion=requested, progress=progress)
     if plot is not None:
         from apc.output.pictures import write_picture
 
@@ -95,7 +95,7 @@ def critical_command(
 
 
 def _over(
-    system: Model,
+    model: Model,
     path: str,
     ends: tuple[str | None, str | None],
     over: tuple[str, ...],
@@ -109,11 +109,11 @@ def _over(
     from apc.tuning.specification import FREE, LOCATION, read_tuning_spec
     from apc.tuning.tuner import tune
 
-    parameter_ref = find(system, path, COMMAND)
-    if is_delay(system, parameter_ref):
+    parameter_ref = find(model, path, COMMAND)
+    if is_delay(model, parameter_ref):
         message = f"{path} is a delay and can't be searched with --over"
         raise ApcError(Diagnostic("E995", COMMAND, message, fix=f"apc critical {path}"))
-    present, unit = value_now(system, parameter_ref), unit_of(system, parameter_ref.name)
+    present, unit = value_now(model, parameter_ref), unit_of(model, parameter_ref.name)
     for end_option, end in zip(("--lower", "--upper"), ends, strict=True):
         if end is not None:
             option_value(end_option, end, subject=path, unit=unit)
@@ -122,10 +122,10 @@ def _over(
     low, high = ends[0] or f"0 {unit}", ends[1] or f"{GROWTH * abs(present):.12g} {unit}"
     try:
         tuning_spec = read_tuning_spec(
-            system, [f"{path}={low}:{high}"], maximize=path, over=over, criterion=criterion
+            model, [f"{path}={low}:{high}"], maximize=path, over=over, criterion=criterion
         )
         with status_line() as progress:
-            return tune(system, tuning_spec, progress=progress)
+            return tune(model, tuning_spec, progress=progress)
     except ApcError as error:
         # The options --free and --maximize are not those of this command.
         raise ApcError(

@@ -42,10 +42,10 @@ def explore_command(
     from apc.app.server import bound, run
     from apc.compiler.source.source import read_source
 
-    system = open_topology(str(path), ())
+    model = open_topology(str(path), ())
     topology = path.with_suffix(".yaml")
     text = read_source(topology).text if topology.is_file() else None
-    topology_file = topology_of(system, settings, text)
+    topology_file = topology_of(model, settings, text)
     server, link = bound(lambda document: open_page(topology_file, document), port)
     echo(link)
     run(server, link, browser=not no_browser)

@@ -52,6 +52,6 @@ def export_command(
     from apc.inputs.open_model import open_topology
 
     chosen = format_of(to, out)
-    system = open_topology(file, settings, {"--out": out}, notify=note_aside)
-    result = export(system, chosen, ExportRequest(open_at, symbolic, peer, device, method), out)
+    model = open_topology(file, settings, {"--out": out}, notify=note_aside)
+    result = export(model, chosen, ExportRequest(open_at, symbolic, peer, device, method), out)
     print_result(result, as_json=as_json, written=[out])

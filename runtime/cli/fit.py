@@ -53,16 +53,16 @@ def fit_command(
     check_topology_name(write, "fitted")
     outputs = {"--write": write, "--plot": plot}
     check_outputs(Path(recording), (), outputs)
-    system = open_topology(file, settings, outputs, varied=free, notify=note_aside)
-    ranges = extension.read_free(system, free)
+    model = open_topology(file, settings, outputs, varied=free, notify=note_aside)
+    ranges = extension.read_free(model, free)
     chosen = parse_method(method) if method is not None else DEFAULT
     with at_work("fitting"):
-        fit = extension.fit(system, Path(recording), ranges, signals=signals, method=chosen)
+        fit = extension.fit(model, Path(recording), ranges, signals=signals, method=chosen)
     refused: ApcError | None = None
     if write is not None:
         try:
             values = {item.name: (item.value, item.unit) for item in fit.parameters}
-            write_values(system, values, settings, write)
+            write_values(model, values, settings, write)
         except ApcError as error:  # the estimates are printed all the same
             refused = error
     if plot is not None:

@@ -62,10 +62,10 @@ def run_command(
 
     path = find_input(file, compiled_too=True)
     folder = out or Path(f"{path.stem}.run")
-    system = open_topology(str(path), settings, notify=note_aside)
+    model = open_topology(str(path), settings, notify=note_aside)
     requested = parse_duration(duration) if duration is not None else None
     how = LocalRun(
-        duration=duration_of(system, requested),
+        duration=duration_of(model, requested),
         secret=_secret(secret_file),
         emulate=emulate,
         seed=seed,
@@ -80,16 +80,16 @@ def run_command(
         if listen or to or device:
             raise click.UsageError("--listen, --to and --device require --peer")
         with at_work("running"):
-            parts = run_all(system, how)
+            parts = run_all(model, how)
     else:
         listening, addresses = _addresses(listen, to, has_secret=bool(how.secret))
         outside = None if device is None else device_function(device)
         with at_work("running"):
-            parts = (run_single(system, peer, listening, addresses, how, device=outside),)
+            parts = (run_single(model, peer, listening, addresses, how, device=outside),)
     troubles = dict.fromkeys(mistake for part in parts if part.trouble for mistake in part.trouble.mistakes)
     played = [part.run for part in parts if part.run is not None]
     if played:
-        write_run(folder, system, played, whole=peer is None)
+        write_run(folder, model, played, whole=peer is None)
     if troubles:
         if played:
             note_aside(f"{folder} contains the recording up to the error")

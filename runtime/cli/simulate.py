@@ -95,35 +95,35 @@ def simulate_command(
     requested = parse_duration(duration) if duration is not None else None
     if out is not None:
         _check_rows(out)
-    system = open_topology(
+    model = open_topology(
         file, settings, {"--out": out, "--plot": plot, "--snapshot": snapshot}, notify=note_aside
     )
     if trace_of is not None:
         from apc.support.extension_table import require_extension
 
-        system = require_extension("loss_models").worst_trace(system)
+        model = require_extension("loss_models").worst_trace(model)
     if joins or leaves:
         from apc.support.extension_table import require_extension
 
-        system = require_extension("changing_counts").with_peer_times(system, joins, leaves)
+        model = require_extension("changing_counts").with_peer_times(model, joins, leaves)
     if impulse is not None:
         from apc.simulation.initial_velocity import WATCHED, impulse_text
         from apc.simulation.initial_velocity import initial_velocity as struck
 
-        system, subject = struck(system, impulse)
+        model, subject = struck(model, impulse)
         note_aside(impulse_text(subject))
-        requested = requested or system.experiment.duration or WATCHED
-    seconds = duration_of(system, requested, runs=runs or 1)
+        requested = requested or model.experiment.duration or WATCHED
+    seconds = duration_of(model, requested, runs=runs or 1)
     if snapshot is not None:
         from apc.output.pictures import write_picture
         from apc.output.still_picture import draw_actors
 
-        write_picture(lambda: draw_actors(system)[0], snapshot)
+        write_picture(lambda: draw_actors(model)[0], snapshot)
     how = Settings(seconds, chosen, seed, jit=not no_jit)
     if runs is not None:
-        _simulate_many(system, how, runs, jobs, as_json=as_json)
+        _simulate_many(model, how, runs, jobs, as_json=as_json)
     else:
-        _simulate_single(system, how, _StoredRows(signals, out, plot, snapshot, error), as_json=as_json)
+        _simulate_single(model, how, _StoredRows(signals, out, plot, snapshot, error), as_json=as_json)
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,13 +153,13 @@ def _check_rows(out: Path) -> None:
         animation.check_animation(out)
 
 
-def _simulate_many(system: Model, how: Settings, runs: int, jobs: int, *, as_json: bool) -> None:
+def _simulate_many(model: Model, how: Settings, runs: int, jobs: int, *, as_json: bool) -> None:
     """Simulate a topology many times and print the statistics."""
     from apc.simulation.monte_carlo import simulate_many
 
     with progress_bar("simulate", "runs") as show:
         many = simulate_many(
-            system,
+            model,
             how,
             runs=runs,
             jobs=jobs,
@@ -170,7 +170,7 @@ def _simulate_many(system: Model, how: Settings, runs: int, jobs: int, *, as_jso
         raise click.Abort
 
 
-def _simulate_single(system: Model, how: Settings, stored: _StoredRows, *, as_json: bool) -> None:
+def _simulate_single(model: Model, how: Settings, stored: _StoredRows, *, as_json: bool) -> None:
     """Simulate a topology once, store the requested rows, and print the summary."""
     from apc.simulation.accuracy import compare_with
     from apc.simulation.simulation import prepare
@@ -183,8 +183,8 @@ def _simulate_single(system: Model, how: Settings, stored: _StoredRows, *, as_js
         moving = stored.out if stored.out.suffix.lower() in SUFFIXES else None
     if moving is not None and stored.signals:
         raise click.UsageError(f"--signals can't be combined with an animation ({moving.suffix})")
-    simulation = prepare(system, how, signals=stored.signals)
-    if any(channel.loss or channel.jitter for link in system.links for channel in link.channels):
+    simulation = prepare(model, how, signals=stored.signals)
+    if any(channel.loss or channel.jitter for link in model.links for channel in link.channels):
         note_aside(f"packet losses and delays are random, seed {simulation.seed}; statistics: --runs 100")
     keeper = Keeper(simulation) if stored.plot is not None or moving is not None else None
     comparison = compare_with(simulation, signals=stored.signals) if stored.error else None
@@ -194,14 +194,14 @@ def _simulate_single(system: Model, how: Settings, stored: _StoredRows, *, as_js
     plot = stored.plot
     if moving is not None and keeper is not None:
         out = partial_name(moving) if interrupted else moving
-        save_animation(system, trajectory_of(simulation, keeper, summary, interrupted), out)
+        save_animation(model, trajectory_of(simulation, keeper, summary, interrupted), out)
     if plot is not None and keeper is not None:
         from apc.output.pictures import write_picture
 
         plot = partial_name(plot) if interrupted else plot
         write_picture(trajectory_of(simulation, keeper, summary, interrupted).plot, plot)
     simulated = SimulationReport(
-        topology=system.name,
+        topology=model.name,
         summary=summary,
         provenance=provenance_of(simulation),
         interrupted=interrupted,

@@ -72,10 +72,10 @@ def sweep_command(
     values = _values(over)
     requested = criterion_with(hands, criterion)
     note_typical_hand(hands)
-    system = open_topology(file, settings, {"--out": out}, hands=hands, varied=over, notify=note_aside)
+    model = open_topology(file, settings, {"--out": out}, hands=hands, varied=over, notify=note_aside)
     with _progress(out) as progress:
         result = sweep(
-            system,
+            model,
             values,
             of=of,
             criterion=requested,

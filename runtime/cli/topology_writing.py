@@ -27,13 +27,13 @@ def check_topology_name(path: Path | None, ending: str) -> None:
 
 
 def write_values(
-    system: Model, values: Mapping[str, tuple[float, str]], settings: Sequence[str], path: Path
+    model: Model, values: Mapping[str, tuple[float, str]], settings: Sequence[str], path: Path
 ) -> None:
     """Write the topology of a model with new values and the settings of the command.
 
     Parameters
     ----------
-    system
+    model
         The model of the command.
     values
         The new values and their units in SI, by name.
@@ -53,7 +53,7 @@ def write_values(
     from apc.parameter_values.overrides import parse_override
     from apc.parameter_values.parameter_names import HELD, find
 
-    as_written = compile_again(replace(system.origin, changes=()), path.parent)
+    as_written = compile_again(replace(model.origin, changes=()), path.parent)
     # The numbers of the hand of --hands held are of no topology.
     names = {setting.partition("=")[0].strip() for setting in settings} - set(HELD)
     names |= {parameter.name for parameter in as_written.parameters}
@@ -64,5 +64,5 @@ def write_values(
     }
     for name, (value, unit) in values.items():
         quantities[find(as_written, name)] = with_unit(f"{value:.12g}", unit).removesuffix(" 1")
-    (text,) = (text for name, text in system.origin.texts if name == system.origin.topology)
+    (text,) = (text for name, text in model.origin.texts if name == model.origin.topology)
     write_topology(path, text.decode(), as_written, quantities)

@@ -67,11 +67,11 @@ def transparency_command(
         raise click.UsageError("--at can't be combined with another device A of --between A:B")
     if nyquist and (out is None or out.suffix.lower() not in FORMATS):
         raise click.UsageError(f"--nyquist requires --out with {', '.join(FORMATS)}")
-    system = open_topology(file, settings, {"--out": out}, operating_point=operating_point, notify=note_aside)
-    with at_work(f"computing the impedance for {counted(system.peers, 'peer')}"):
-        hertz = read_frequencies(system, frequencies, low, high, points)
+    model = open_topology(file, settings, {"--out": out}, operating_point=operating_point, notify=note_aside)
+    with at_work(f"computing the impedance for {counted(model.peers, 'peer')}"):
+        hertz = read_frequencies(model, frequencies, low, high, points)
         result = transparency(
-            numeric_model(system),
+            numeric_model(model),
             hertz,
             at=at or first if colon else at,
             between=second if colon else between,

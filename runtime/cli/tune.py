@@ -96,7 +96,7 @@ def tune_command(
     check_topology_name(write, "tuned")
     if write is not None and tradeoff:
         raise click.UsageError("--write can't be combined with --tradeoff")
-    system = open_topology(
+    model = open_topology(
         file,
         settings,
         {"--write": write, "--plot": plot},
@@ -106,10 +106,10 @@ def tune_command(
     )
     criterion = criterion_with(hands, None)
     if hands == FREE:
-        system, criterion = gripped_as_studied(system)
-    system = linearized_at(system, operating_point)  # with the hands of the study
+        model, criterion = gripped_as_studied(model)
+    model = linearized_at(model, operating_point)  # with the hands of the study
     tuning_spec = read_tuning_spec(
-        system,
+        model,
         free,
         maximize=maximize,
         minimize=minimize,
@@ -118,23 +118,23 @@ def tune_command(
         criterion=criterion,
     )
     if plot is not None and not tradeoff:  # an impossible picture is refused before the search
-        panels_of(system, len(tuning_spec.free))
+        panels_of(model, len(tuning_spec.free))
     if tradeoff:
         with status_line() as progress, _without_criterion():
             weighed = require_extension("pareto_front").pareto_front(
-                system, tuning_spec, read_tradeoff(tradeoff), seconds=read_seconds(time), progress=progress
+                model, tuning_spec, read_tradeoff(tradeoff), seconds=read_seconds(time), progress=progress
             )
         if plot is not None:
             write_picture(weighed.plot, plot)
         print_result(weighed, as_json=as_json, written=[plot])
         return
     with status_line() as progress, _without_criterion():
-        tuning = tune(system, tuning_spec, seconds=read_seconds(time), progress=progress)
+        tuning = tune(model, tuning_spec, seconds=read_seconds(time), progress=progress)
     refused: ApcError | None = None
     if write is not None and tuning.feasible:
         try:
             values = {gain.parameter: (float(gain.value), gain.unit) for gain in tuning.gains}
-            write_values(system, values, settings, write)
+            write_values(model, values, settings, write)
         except ApcError as error:  # the gains are shown all the same
             refused = error
     if plot is not None:

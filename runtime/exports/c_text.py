@@ -40,7 +40,7 @@ def memory(peer: ExportedPeer, signal: LocalSignal) -> str:
 
 def parameter_units(peer: ExportedPeer) -> dict[str, str]:
     """Return the unit of each of a peer's parameters, by name."""
-    units = {parameter.name: parameter.unit for parameter in peer.system.parameters}
+    units = {parameter.name: parameter.unit for parameter in peer.model.parameters}
     return {name: units.get(name, "1") for name in peer.peer_type.parameters}
 
 
@@ -52,9 +52,9 @@ def _output(peer: ExportedPeer, partition: int, output: int) -> str:
 
 def _filled(file: str, peer: ExportedPeer, **values: object) -> str:
     """Return one of a peer's texts from a template, with the data of its title."""
-    system, clocks = peer.system, {partition.clock for partition in peer.peer_type.clocks}
-    timings = {timing.name: float(timing.value) for timing in system.timings}
-    periods = [(clock.name, timings[clock.period]) for clock in system.clocks if clock.name in clocks]
+    model, clocks = peer.model, {partition.clock for partition in peer.peer_type.clocks}
+    timings = {timing.name: float(timing.value) for timing in model.timings}
+    periods = [(clock.name, timings[clock.period]) for clock in model.clocks if clock.name in clocks]
     shared = {"peer": peer, "name": peer.identifier, "periods": periods, "version": program_version()}
     return filled(file, **shared, **values)
 

@@ -38,12 +38,12 @@ class Code(Result):
     shown_by: ClassVar[str] = "exports_output:code"
 
 
-def peer_code(system: Model, *, peer: str = "", device: str = "", method: str = "") -> Code:
+def peer_code(model: Model, *, peer: str = "", device: str = "", method: str = "") -> Code:
     """Return one peer as C code.
 
     Parameters
     ----------
-    system
+    model
         The model.
     peer
         The name of the peer, such as "left[1]"; optional if all peers are equal.
@@ -58,35 +58,35 @@ def peer_code(system: Model, *, peer: str = "", device: str = "", method: str = 
     ApcError
         E963 the peers differ, and no name is given; E970 no such peer; and as `peer_of`, `parse_method`.
     """
-    chosen_method, plan = _plan(system, method)
+    chosen_method, plan = _plan(model, method)
     if not peer and len(set(subsystems_of(plan))) > 1:
         message = "the peers differ; C code is written for one peer"
         fix = f'--peer "{plan.exchange.peer_name(0)}"'
-        raise ApcError(Diagnostic("E963", SourceLocation(system.origin.topology), message, fix=fix))
+        raise ApcError(Diagnostic("E963", SourceLocation(model.origin.topology), message, fix=fix))
     result = peer_of(
         plan, number_of(plan.exchange, peer, "--peer") if peer else 0, chosen_method, device=device or None
     )
-    return Code(system.name, result, str(chosen_method))
+    return Code(model.name, result, str(chosen_method))
 
 
-def topology_unit(system: Model, *, peer: str = "", method: str = "") -> FmuContent:
+def topology_unit(model: Model, *, peer: str = "", method: str = "") -> FmuContent:
     """Return an FMU of a model, or of one peer of the model; parameters and errors as for `peer_code`."""
-    chosen_method, plan = _plan(with_external_force(system), method)
+    chosen_method, plan = _plan(with_external_force(model), method)
     topology = (
         single_peer(plan, number_of(plan.exchange, peer, "--peer"), chosen_method)
         if peer
         else c_topology(plan, chosen_method)
     )
-    return unit_of(system, topology, peer=peer)
+    return unit_of(model, topology, peer=peer)
 
 
-def _plan(system: Model, method: str) -> tuple[Method, SimulationPlan]:
+def _plan(model: Model, method: str) -> tuple[Method, SimulationPlan]:
     """Return the integration method of a text, and the simulation plan of a model."""
     chosen_method = parse_method(method) if method else DEFAULT
-    if not system.clocks:
-        raise refused(system, f"{system.name} has no clock, so nothing is computed at ticks")
-    with finite_equations(system.name):
-        return chosen_method, plan_of(system, chosen_method)
+    if not model.clocks:
+        raise refused(model, f"{model.name} has no clock, so nothing is computed at ticks")
+    with finite_equations(model.name):
+        return chosen_method, plan_of(model, chosen_method)
 
 
 _INCLUDED = re.compile(r"[^\x00-\x1f\"\\]+")

@@ -23,20 +23,20 @@ from apc.parameter_values.parameters import resolve
 FORCE_ON = "force on "  # followed by the name of the device
 
 
-def with_external_force(system: Model) -> Model:
+def with_external_force(model: Model) -> Model:
     """Return a model with a force on each device: a parameter that the fastest clock outputs.
 
     Parameters
     ----------
-    system
+    model
         The model. A peer without a device, or without clocked forces, is unchanged.
     """
-    unit_of = {parameter.name: parameter.unit for parameter in system.parameters}
-    numbers, direct = resolve(system), coupled_directly(system.peer_types)
-    periods = {clock.name: numbers.timings[clock.period] for clock in system.clocks}
-    peer_types, added = list(system.peer_types), dict[str, Parameter]()
-    for index, group in enumerate(system.groups):
-        peer_type = system.peer_types[group.peer_type]
+    unit_of = {parameter.name: parameter.unit for parameter in model.parameters}
+    numbers, direct = resolve(model), coupled_directly(model.peer_types)
+    periods = {clock.name: numbers.timings[clock.period] for clock in model.clocks}
+    peer_types, added = list(model.peer_types), dict[str, Parameter]()
+    for index, group in enumerate(model.groups):
+        peer_type = model.peer_types[group.peer_type]
         if peer_types[group.peer_type] is not peer_type or not peer_type.clocks:
             continue
         result = find_devices(jacobians(peer_type), numbers.parameters[index][0], unit_of, direct=direct)
@@ -49,12 +49,12 @@ def with_external_force(system: Model) -> Model:
         if devices:
             peer_types[group.peer_type] = _with_external_force(peer_type, devices, fastest)
             added |= {name: Parameter(name, "N", 0.0, description="external force") for name in devices}
-    timings = {timing.name: timing for timing in (Timing(NO_DELAY, Fraction(0)), *system.timings)}
+    timings = {timing.name: timing for timing in (Timing(NO_DELAY, Fraction(0)), *model.timings)}
     return replace(
-        system,
+        model,
         peer_types=tuple(peer_types),
-        parameters=(*system.parameters, *added.values()),
-        timings=tuple(timings.values()) if added else system.timings,
+        parameters=(*model.parameters, *added.values()),
+        timings=tuple(timings.values()) if added else model.timings,
     )
 
 

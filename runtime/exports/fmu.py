@@ -44,7 +44,7 @@ class FmuContent(Result):
     `step` and `duration` are the proposed step size and duration in seconds; `guid` is a digest of the texts.
     """
 
-    system: Model
+    model: Model
     peer: str
     topology: CTopology
     step: float
@@ -61,16 +61,16 @@ class FmuContent(Result):
     @property
     def description(self) -> str:
         """The model description, modelDescription.xml."""
-        name = f"{self.peer} of {self.system.name}" if self.peer else self.system.name
-        fields = {"name": name, "description": self.system.description, "variables": self.topology.variables}
+        name = f"{self.peer} of {self.model.name}" if self.peer else self.model.name
+        fields = {"name": name, "description": self.model.description, "variables": self.topology.variables}
         return filled("fmu.xml", unit=self, version=program_version(), **fields)
 
 
-def unit_of(system: Model, topology: CTopology, *, peer: str = "") -> FmuContent:
+def unit_of(model: Model, topology: CTopology, *, peer: str = "") -> FmuContent:
     """Return the content of the FMU of a model, or of the peer of that name."""
-    timings = {timing.name: timing.value for timing in system.timings}
-    step = float(min(timings[clock.period] for clock in system.clocks))
-    duration = system.experiment.duration
+    timings = {timing.name: timing.value for timing in model.timings}
+    step = float(min(timings[clock.period] for clock in model.clocks))
+    duration = model.experiment.duration
     texts: dict[str, str] = {}
     for code in topology.codes:
         texts[f"{code.identifier}.h"] = header(code)
@@ -82,7 +82,7 @@ def unit_of(system: Model, topology: CTopology, *, peer: str = "") -> FmuContent
         **shared(topology),
     )
     guid = hashlib.sha256("\0".join((*texts.values(), main)).encode()).hexdigest()
-    unit = FmuContent(system, peer, topology, step, float(duration) if duration else 1.0, guid, texts)
+    unit = FmuContent(model, peer, topology, step, float(duration) if duration else 1.0, guid, texts)
     texts[f"{unit.identifier}.c"] = main.replace(OFFSET_OF_GUID, guid)
     return unit
 

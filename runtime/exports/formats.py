@@ -123,12 +123,12 @@ def format_of(to: str | None, out: Path | None, *, option: str = "--") -> Format
     return result
 
 
-def export(system: Model, chosen: Format, request: ExportRequest, out: Path | None = None) -> Result:
+def export(model: Model, chosen: Format, request: ExportRequest, out: Path | None = None) -> Result:
     """Return the export of a model in a format, written to a file if `out` is given.
 
     Parameters
     ----------
-    system
+    model
         The model.
     chosen, request
         The format, from `format_of`, and the export options.
@@ -149,9 +149,9 @@ def export(system: Model, chosen: Format, request: ExportRequest, out: Path | No
             raise ApcError(
                 Diagnostic("E953", SourceLocation(option), message, fix=f"--to {able}" if able else "")
             )
-    refuse_range(system)
+    refuse_range(model)
     make, write = _export_functions(chosen.name)
-    result = make(system, **{name: getattr(request, name) for name in chosen.takes})
+    result = make(model, **{name: getattr(request, name) for name in chosen.takes})
     if out is not None:
         write(out, result)
     return result

@@ -158,12 +158,12 @@ IN_FLOATS = FrameNumbers(
 )
 
 
-def state_space(system: Model, *, open_at: str = "") -> StateSpace:
+def state_space(model: Model, *, open_at: str = "") -> StateSpace:
     """Return the state space of a model, with all peers in one system.
 
     Parameters
     ----------
-    system
+    model
         The model.
     open_at
         The link or coupler at which the loop is cut; "" for the closed loop.
@@ -173,14 +173,14 @@ def state_space(system: Model, *, open_at: str = "") -> StateSpace:
     ApcError
         E950 no such link or coupler; E951 too many states; and those of `analysis.lifted_classes`.
     """
-    groups, exchange = peers_of(numeric_model(system))
-    (a, b, c, d), (states, inputs, outputs), unpushed = lifted(system, groups, exchange, open_at, IN_FLOATS)
+    groups, exchange = peers_of(numeric_model(model))
+    (a, b, c, d), (states, inputs, outputs), unpushed = lifted(model, groups, exchange, open_at, IN_FLOATS)
     if not all(np.isfinite(block).all() for block in (a, b, c, d)):
-        raise ApcError(Diagnostic("E806", SourceLocation(system.name), TOO_LARGE))
-    frame_s, notes = description(system)
+        raise ApcError(Diagnostic("E806", SourceLocation(model.name), TOO_LARGE))
+    frame_s, notes = description(model)
     notes = (*notes, *unpushed)
     return StateSpace(
-        system.name, open_at, frame_s, a, b, c, d, states, inputs, outputs, notes, made_by(system)
+        model.name, open_at, frame_s, a, b, c, d, states, inputs, outputs, notes, made_by(model)
     )
 
 
@@ -202,26 +202,26 @@ def peers_of(numeric: NumericModel) -> tuple[tuple[PeerClass, ...], Communicatio
         ) from None
 
 
-def description(system: Model) -> tuple[float, tuple[str, ...]]:
+def description(model: Model) -> tuple[float, tuple[str, ...]]:
     """Return the length of a model's frame in seconds, and the limitations of its linear map."""
-    numeric = numeric_model(system)
-    return float(numeric.schedules[0].frame_s), (*near_start(numeric), *limitations(system))
+    numeric = numeric_model(model)
+    return float(numeric.schedules[0].frame_s), (*near_start(numeric), *limitations(model))
 
 
-def made_by(system: Model) -> str:
+def made_by(model: Model) -> str:
     """Return the provenance of a model's export, as one line of JSON."""
     description = {
-        "topology": system.name,
-        "texts": texts_of(system),
-        "parameters": parameters_of(system),
-        "timings": [(timing.name, str(timing.value)) for timing in system.timings],
+        "topology": model.name,
+        "texts": texts_of(model),
+        "parameters": parameters_of(model),
+        "timings": [(timing.name, str(timing.value)) for timing in model.timings],
         "versions": versions("casadi", "numpy"),
     }
     return json.dumps(description, ensure_ascii=False)
 
 
 def lifted(
-    system: Model,
+    model: Model,
     groups: Sequence[PeerClass],
     exchange: CommunicationGraph,
     open_at: str,
@@ -231,17 +231,17 @@ def lifted(
 
     Parameters
     ----------
-    system, open_at
+    model, open_at
         As for `state_space`.
     groups, exchange
         The peers and the communication graph, from `analysis.lifted_classes`.
     numbers
         The numerical parts of the frame.
     """
-    with single_threaded(), finite_equations(system.name), np.errstate(all="ignore"):
-        link = _link_of(system, open_at)
-        driven_peers = [_open_loop(system, group, "" if link else open_at, numbers) for group in groups]
-        _check_size(system, driven_peers)
+    with single_threaded(), finite_equations(model.name), np.errstate(all="ignore"):
+        link = _link_of(model, open_at)
+        driven_peers = [_open_loop(model, group, "" if link else open_at, numbers) for group in groups]
+        _check_size(model, driven_peers)
         loop = dense_loop([item.group for item in driven_peers], exchange)
         peers_of_class = {item.group.index: item for item in driven_peers}
         subsystems = [peers_of_class[subsystem.index] for subsystem in loop.subsystems]
@@ -267,10 +267,10 @@ class _DrivenPeers:
     unpushed: tuple[str, ...]
 
 
-def _open_loop(system: Model, group: PeerClass, open_at: str, numbers: FrameNumbers) -> _DrivenPeers:
+def _open_loop(model: Model, group: PeerClass, open_at: str, numbers: FrameNumbers) -> _DrivenPeers:
     """Return some peers with forces and noise as inputs, and with the forces of a coupler cut open."""
     schedule, peer_type = _with_computed_values(group), group.jacobians.peer_type
-    (forces, unpushed), noises = _force_inputs(system, group), _sampled_states(group.subsystem)
+    (forces, unpushed), noises = _force_inputs(model, group), _sampled_states(group.subsystem)
     inverses = [numbers.inverses(group, force) for force in forces]
     extended = _with_inputs(numbers.subsystem(group), forces, inverses, noises)
     count = len(forces) + len(noises)
@@ -345,9 +345,9 @@ def _instants(schedule: Schedule) -> dict[int, list[int]]:
     return result
 
 
-def _force_inputs(system: Model, group: PeerClass) -> tuple[list[ForceInput], list[str]]:
+def _force_inputs(model: Model, group: PeerClass) -> tuple[list[ForceInput], list[str]]:
     """Return the force inputs of a peer's bodies, axis by axis, and the reasons for bodies without one."""
-    unit_of = {parameter.name: parameter.unit for parameter in system.parameters}
+    unit_of = {parameter.name: parameter.unit for parameter in model.parameters}
     device_cache: dict[str, Device | str | None] = {}
     result = [
         find_push(group.jacobians, group.parameters, unit_of, group.initial_reception, index, device_cache)
@@ -392,16 +392,16 @@ def _with_inputs(
     return extended
 
 
-def _link_of(system: Model, open_at: str) -> str:
+def _link_of(model: Model, open_at: str) -> str:
     """Return the link at which the loop is cut, "" for a coupler. Raises ApcError E950 for another name."""
-    links = [link.name for link in system.links]
-    parts = {hold.name.rpartition(".")[0] for peer_type in system.peer_types for hold in peer_type.holds}
+    links = [link.name for link in model.links]
+    parts = {hold.name.rpartition(".")[0] for peer_type in model.peer_types for hold in peer_type.holds}
     if open_at in links:
         return open_at
     if open_at and open_at not in parts:
         known = [*links, *sorted(parts)]
         listed = ", ".join(known) or "it has none"
-        message = f"{open_at[:80]} is not a link or sampled coupler of {system.name} ({listed})"
+        message = f"{open_at[:80]} is not a link or sampled coupler of {model.name} ({listed})"
         near = nearest(open_at, known) or (known[0] if known else "")
         raise ApcError(
             Diagnostic("E950", SourceLocation("--open-at"), message, fix=f"--open-at {near}" if near else "")
@@ -439,7 +439,7 @@ def _cut_open(
     return cut_subsystem, replace(cut_schedule, value_names=names), computed
 
 
-def _check_size(system: Model, opened: Sequence[_DrivenPeers]) -> None:
+def _check_size(model: Model, opened: Sequence[_DrivenPeers]) -> None:
     """Raise ApcError E951 for a model whose matrix exceeds the memory."""
     columns = sum(item.group.count * states_of(item.group.schedule, item.group.jacobians) for item in opened)
     peers = sum(item.group.count for item in opened)
@@ -447,9 +447,9 @@ def _check_size(system: Model, opened: Sequence[_DrivenPeers]) -> None:
     first = max(opened, key=lambda opened: opened.group.count).group
     advice = (
         "reduce the number of peers, such as by --set "
-        f"{system.groups[0].name if len(opened) == 1 else first.name}.count=10"
+        f"{model.groups[0].name if len(opened) == 1 else first.name}.count=10"
     )
-    refuse_beyond(ENTRY * columns**2, "E951", SourceLocation(system.origin.topology), message, advice)
+    refuse_beyond(ENTRY * columns**2, "E951", SourceLocation(model.origin.topology), message, advice)
 
 
 def _closed(

@@ -83,12 +83,12 @@ def write_modelica(path: Path, modelica_model: ModelicaModel) -> None:
     write_text(path, modelica_model.text)
 
 
-def modelica(system: Model) -> ModelicaModel:
+def modelica(model: Model) -> ModelicaModel:
     """Return a model as Modelica text.
 
     Parameters
     ----------
-    system
+    model
         The model.
 
     Raises
@@ -96,33 +96,33 @@ def modelica(system: Model) -> ModelicaModel:
     ApcError
         E955 a construct without a Modelica equivalent; E801, E802 an undefined mean.
     """
-    with finite_equations(system.name):
-        return _ModelicaWriter(stamped(system)).model()
+    with finite_equations(model.name):
+        return _ModelicaWriter(stamped(model)).complete()
 
 
 class _ModelicaWriter:
     """The text of a model: declarations and equations, added when they are needed."""
 
-    def __init__(self, system: Model) -> None:
-        self.system = system
-        self.numbers = resolve(system)
-        self.exchange: CommunicationGraph = build_exchange(system, self.numbers.timings)
+    def __init__(self, model: Model) -> None:
+        self.model = model
+        self.numbers = resolve(model)
+        self.exchange: CommunicationGraph = build_exchange(model, self.numbers.timings)
         timing = self.numbers.timings
-        self.grids = {clock.name: (timing[clock.period], timing[clock.phase]) for clock in system.clocks}
-        self.clock_of = {link.name: link.clock for link in system.links}
+        self.grids = {clock.name: (timing[clock.period], timing[clock.phase]) for clock in model.clocks}
+        self.clock_of = {link.name: link.clock for link in model.links}
         self.used: set[str] = set()
         self.parameters: dict[str, tuple[Text, str]] = {}
         self.declared: list[str] = []
         self.equations: list[str] = []
-        _refuse_unsupported(system, self.exchange)
+        _refuse_unsupported(model, self.exchange)
         self.clocks, self.clock_lines = self._clocks()
         self.named: dict[Any, Text] = {}  # variables that are declared once and used several times
         self.sent: dict[tuple[int, str], list[tuple[Text, str]]] = {}  # sent values, with their channels
 
-    def model(self) -> ModelicaModel:
+    def complete(self) -> ModelicaModel:
         """Return the complete model."""
-        system, name = self.system, identifier(word(self.system.name))
-        groups = [g for g, group in enumerate(system.groups) for _ in range(group.count)]
+        model, name = self.model, identifier(word(self.model.name))
+        groups = [g for g, group in enumerate(model.groups) for _ in range(group.count)]
         peers = [_Peer(self, number, group) for number, group in enumerate(groups)]
         for peer in peers:
             peer.declare()
@@ -139,21 +139,20 @@ class _ModelicaWriter:
         text = filled(
             "modelica.jinja",
             name=name,
-            system=system,
-            title=system.description or system.name,
+            model=model,
+            title=model.description or model.name,
             version=program_version(),
-            texts=texts_of(system),
+            texts=texts_of(model),
             parameters=[line for _, line in self.parameters.values()],
             clocks=self.clock_lines,
             declared=self.declared,
             equations=self.equations,
-            duration=float(system.experiment.duration or SECOND),
+            duration=float(model.experiment.duration or SECOND),
             step=float(min((period for period, _ in self.grids.values()), default=SECOND / 1000)),
-            description=f"The equations that apc compiled of {system.name}: "
-            "all peers, every tick and packet.",
+            description=f"The equations that apc compiled of {model.name}: all peers, every tick and packet.",
         )
         return ModelicaModel(
-            topology=system.name,
+            topology=model.name,
             name=name,
             text=text.rstrip("\n"),
             peers=len(peers),
@@ -195,7 +194,7 @@ class _ModelicaWriter:
         """
         if len(self.declared) >= MOST_TERMS:
             raise _refused(
-                self.system, f"more than {MOST_TERMS:,} variables", "reduce the number of peers by --set"
+                self.model, f"more than {MOST_TERMS:,} variables", "reduce the number of peers by --set"
             )
         variable, modelica_unit = self.name(name), unit_of_modelica(unit)
         modifiers = [f'unit="{modelica_unit}"'] if modelica_unit else []
@@ -282,7 +281,7 @@ class _ModelicaWriter:
             return value
         if not delay and (second - first) % _grid([slow, fast]) == 0:
             message = f"{link} without delay to {clock}: their ticks coincide but start at different times"
-            raise _refused(self.system, message, f"set a delay of {link}, or use clocks of equal phase")
+            raise _refused(self.model, message, f"set a delay of {link}, or use clocks of equal phase")
         advanced_delay = delay - _grid([slow, fast, first, second, delay]) / 2 if delay else delay
         value = self.delayed(value, f"{label} sent for {clock}", sends_at, advanced_delay)
         held_value = self.like(value, f"{delayed_label} for {clock}", f"hold({value.text})")
@@ -294,13 +293,13 @@ class _ModelicaWriter:
         """Raise ApcError E955 for a counter beyond the range of Modelica's Integer."""
         if max(counters) > LARGEST_COUNTER:
             message = f"a clock that counts to {max(counters):,}, more than the range of a Modelica Integer"
-            raise _refused(self.system, message, "use times that are simple multiples of each other")
+            raise _refused(self.model, message, "use times that are simple multiples of each other")
 
     def _clocks(self) -> tuple[dict[str, str], list[str]]:
         """Return the name of each clock, and the lines that declare the clocks, fastest first."""
-        used_clocks = {part.clock for peer_type in self.system.peer_types for part in peer_type.clocks}
+        used_clocks = {part.clock for peer_type in self.model.peer_types for part in peer_type.clocks}
         used_clocks |= {
-            self.clock_of[sending.link] for peer_type in self.system.peer_types for sending in peer_type.sends
+            self.clock_of[sending.link] for peer_type in self.model.peer_types for sending in peer_type.sends
         }
         clock_by_grid: dict[tuple[Fraction, Fraction], str] = {}
         names: dict[str, str] = {}
@@ -354,13 +353,13 @@ class _Peer:
     """The variables of one peer: its parameters `p`, states `x` and hold outputs `u`."""
 
     def __init__(self, writer: _ModelicaWriter, number: int, group: int) -> None:
-        self.writer, self.number, self.group = writer, number, writer.system.groups[group]
-        system, numbers, exchange = writer.system, writer.numbers, writer.exchange
-        self.peer_type, self.name = system.peer_types[self.group.peer_type], exchange.peer_name(number)
+        self.writer, self.number, self.group = writer, number, writer.model.groups[group]
+        model, numbers, exchange = writer.model, writer.numbers, writer.exchange
+        self.peer_type, self.name = model.peer_types[self.group.peer_type], exchange.peer_name(number)
         self.role = exchange.delay_class(group)
         rows = numbers.parameters[group]
         self.vector = rows[numbers.rows[group][number - int(exchange.starts[group])]].tolist()
-        described = {parameter.name: parameter for parameter in system.parameters}
+        described = {parameter.name: parameter for parameter in model.parameters}
         begins = {state.start for state in self.peer_type.states}
         self.p: list[Text] = []
         for index, (name, value) in enumerate(zip(self.peer_type.parameters, self.vector, strict=True)):
@@ -447,7 +446,7 @@ class _Peer:
         """Return the variable of a receive: the reduction of all received values."""
         writer, link, exchange = self.writer, receive.link, self.writer.exchange
         terms, weights, unit = [], [], NONE
-        for sender, inexact in received_by(writer.system, exchange, link, self.number):
+        for sender, inexact in received_by(writer.model, exchange, link, self.number):
             weight, role = exact_weight(inexact), exchange.delay_class(exchange.group_of(sender))
             timing = exchange.delay(link, role, self.role)
             received = [
@@ -479,19 +478,19 @@ class _Peer:
         return writer.let(f"{self.name}.{receive.name}", value or "0", unit)
 
 
-def _refuse_unsupported(system: Model, exchange: CommunicationGraph) -> None:
+def _refuse_unsupported(model: Model, exchange: CommunicationGraph) -> None:
     """Raise ApcError E955 for constructs that Modelica equations cannot express."""
-    for _, law in unreliable(system):
+    for _, law in unreliable(model):
         message = f"{chance(law)}: random packet loss or delay"
-        raise _refused(system, message, "use a reliable link, or apc simulate")
-    for link in system.links:
+        raise _refused(model, message, "use a reliable link, or apc simulate")
+    for link in model.links:
         if link.after:
             message = f"packets of {link.name} that take the values after the ticks (order: after)"
-            raise _refused(system, message, "use order: before, or apc simulate")
+            raise _refused(model, message, "use order: before, or apc simulate")
         if len(link.clocks) > 1:
             message = f"different clocks of the pairs of groups of {link.name}"
-            raise _refused(system, message, "use one link for each clock, or apc simulate")
-    for peer_type in system.peer_types:
+            raise _refused(model, message, "use one link for each clock, or apc simulate")
+    for peer_type in model.peer_types:
         for function, _, message, _ in [
             (peer_type.derivative, "", "what moves", ""),
             *instant_functions(peer_type),
@@ -500,7 +499,7 @@ def _refuse_unsupported(system: Model, exchange: CommunicationGraph) -> None:
                 solved = (
                     f"the nonlinear loop of {peer_type.name} that Newton's method solves for {message[:120]}"
                 )
-                raise _refused(system, solved, "use a coupler without an algebraic loop")
+                raise _refused(model, solved, "use a coupler without an algebraic loop")
     peers = exchange.peers
     terms = sum(
         peers * (peers - 1) if exchange.is_complete(link) else len(exchange.arcs(link)[0])
@@ -509,16 +508,16 @@ def _refuse_unsupported(system: Model, exchange: CommunicationGraph) -> None:
     if max(terms, peers) > MOST_TERMS:
         message = f"{peers:,} peers with {terms:,} directed connections"
         raise _refused(
-            system, message, f"reduce the number of peers, such as by --set {system.groups[0].name}.count=10"
+            model, message, f"reduce the number of peers, such as by --set {model.groups[0].name}.count=10"
         )
 
 
-def _refused(system: Model, subject: str, advice: str) -> ApcError:
+def _refused(model: Model, subject: str, advice: str) -> ApcError:
     """Return error E955 for a construct without a Modelica equivalent."""
     return ApcError(
         Diagnostic(
             "E955",
-            SourceLocation(system.origin.topology),
+            SourceLocation(model.origin.topology),
             f"no Modelica equivalent of {subject}",
             advice=advice,
         )

@@ -149,7 +149,7 @@ class ExportedPeer:
     `settable` are the indices of the parameters used only in ticks (see `_settable`).
     """
 
-    system: Model
+    model: Model
     name: str
     identifier: str
     number: int
@@ -212,21 +212,21 @@ def peer_of(
         E960 the peer is not finite arithmetic, or has no ticks; E961 no device, or one that cannot be
         separated.
     """
-    system, group = plan.system, plan.exchange.group_of(number)
-    index = system.groups[group].peer_type
-    peer_type, subsystem, schedule = system.peer_types[index], plan.subsystems[index], plan.schedules[group]
+    model, group = plan.model, plan.exchange.group_of(number)
+    index = model.groups[group].peer_type
+    peer_type, subsystem, schedule = model.peer_types[index], plan.subsystems[index], plan.schedules[group]
     vector, label = _parameters(plan, number), plan.exchange.peer_name(number)
-    _refuse_iterations(system, label, peer_type)
-    outside = _external_states(system, label, subsystem, vector, device)
+    _refuse_iterations(model, label, peer_type)
+    outside = _external_states(model, label, subsystem, vector, device)
     instants, lengths = _instants(schedule)
     lines, channels = lines_of(plan, number)
     evaluated_at = sorted(outside & _states_read(peer_type))
     measured = prefixed("measured", (peer_type.states[row].name for row in evaluated_at))
-    forces = _forces(system, label, subsystem, vector, outside)
+    forces = _forces(model, label, subsystem, vector, outside)
     force_names = prefixed("force", (force.name for force in forces))
     x, _, memories = start_values(subsystem, [float(item) for item in vector])
     return ExportedPeer(
-        system=system,
+        model=model,
         name=label,
         identifier=name or identifier(label),
         number=number,
@@ -290,7 +290,7 @@ def subsystems_of(plan: SimulationPlan) -> tuple[int, ...]:
     graphs = [link for link in plan.exchange.links if not plan.exchange.is_complete(link)]
     for number in range(plan.exchange.peers):
         received = tuple(
-            tuple(weight for _, weight in received_by(plan.system, plan.exchange, link, number))
+            tuple(weight for _, weight in received_by(plan.model, plan.exchange, link, number))
             for link in graphs
         )
         key = plan.exchange.group_of(number), _parameters(plan, number).tobytes(), received
@@ -298,45 +298,45 @@ def subsystems_of(plan: SimulationPlan) -> tuple[int, ...]:
     return tuple(numbers)
 
 
-def refused(system: Model, message: str, fix: str = "", code: str = "E960", *, advice: str = "") -> ApcError:
+def refused(model: Model, message: str, fix: str = "", code: str = "E960", *, advice: str = "") -> ApcError:
     """Return the error for a peer that cannot be exported as C.
 
     Parameters
     ----------
-    system
+    model
         The model.
     message, fix, code, advice
         The fields of the diagnostic.
     """
-    return ApcError(Diagnostic(code, SourceLocation(system.origin.topology), message, fix=fix, advice=advice))
+    return ApcError(Diagnostic(code, SourceLocation(model.origin.topology), message, fix=fix, advice=advice))
 
 
-def _refuse_iterations(system: Model, name: str, peer_type: PeerType) -> None:
+def _refuse_iterations(model: Model, name: str, peer_type: PeerType) -> None:
     """Raise ApcError E960 for a peer with equations solved by Newton's method, or without ticks.
 
     A peer that sends after its ticks is refused, too.
     """
-    if after := [link.name for link in system.links if link.after]:
+    if after := [link.name for link in model.links if link.after]:
         message = f"packets of {after[0]} take the values after the ticks (order: after)"
         advice = "use order: before, or apc run"
-        raise refused(system, f"{message}, which is not exported to C", advice=advice)
-    if several := [link.name for link in system.links if len(link.clocks) > 1]:
+        raise refused(model, f"{message}, which is not exported to C", advice=advice)
+    if several := [link.name for link in model.links if len(link.clocks) > 1]:
         message = f"pairs of groups of {several[0]} have different clocks, which is not exported to C"
-        raise refused(system, message, advice="use one link for each clock, or apc simulate")
+        raise refused(model, message, advice="use one link for each clock, or apc simulate")
     for function, when, message, where in instant_functions(peer_type):
         if not function.is_a("SXFunction"):
             message = f"{name}: {when}{message}{where} need an iteration, which is not exported to C"
-            raise refused(system, message, advice="write equations that can be solved for them")
+            raise refused(model, message, advice="write equations that can be solved for them")
     if not peer_type.clocks:
         message = f"{name} computes nothing at ticks of a clock, so there is no C code"
-        raise refused(system, message)
+        raise refused(model, message)
 
 
 # ---- states outside the computer
 
 
 def _external_states(
-    system: Model, name: str, subsystem: SubsystemJacobians, vector: Any, device: str | None
+    model: Model, name: str, subsystem: SubsystemJacobians, vector: Any, device: str | None
 ) -> frozenset[int]:
     """Return the states that the peer's computer does not integrate: those of its devices.
 
@@ -358,19 +358,19 @@ def _external_states(
         for mass in sorted(chosen - masses):
             near = nearest(mass, masses) or min(masses, default=NO_DEVICE)
             message = f"--device: unknown mass {mass[:40]!r} of {name}"
-            raise refused(system, message, f"--device {near}", "E961")
+            raise refused(model, message, f"--device {near}", "E961")
     else:
-        unit_of = {parameter.name: parameter.unit for parameter in system.parameters}
-        devices = find_devices(subsystem, vector, unit_of, direct=coupled_directly(system.peer_types))
+        unit_of = {parameter.name: parameter.unit for parameter in model.parameters}
+        devices = find_devices(subsystem, vector, unit_of, direct=coupled_directly(model.peer_types))
         chosen = {text.rpartition(".")[0] if text.endswith("]") else text for text in devices}
     if not chosen:
         fix = f"--device {NO_DEVICE}, or --device {min(masses, default=NO_DEVICE)}"
         message = f"{name} has no device: each of its masses is sent to other peers"
-        raise refused(system, message, fix, "E961")
+        raise refused(model, message, fix, "E961")
     listed = sorted(chosen)
     if device is None and not peer_type.held and len(listed) > 1:
         message = f"{name}: {' and '.join(listed)} may be devices or object copies"
-        raise refused(system, message, f"--device {','.join(listed)}, or --device {listed[0]}", "E961")
+        raise refused(model, message, f"--device {','.join(listed)}, or --device {listed[0]}", "E961")
     outside: set[int] = set()
     for rows in coupled_sets:
         inside = {parts[row] for row in rows}
@@ -383,7 +383,7 @@ def _external_states(
                 f"while {moving} is a physical device"
             )
             advice = "connect them by a part with a clock, such as SampledSpringDamper"
-            raise refused(system, message, f"--device {NO_DEVICE}", "E961", advice=advice)
+            raise refused(model, message, f"--device {NO_DEVICE}", "E961", advice=advice)
         outside |= rows
     return frozenset(outside)
 
@@ -407,13 +407,13 @@ def _states_read(peer_type: PeerType) -> frozenset[int]:
 
 
 def _forces(
-    system: Model, name: str, subsystem: SubsystemJacobians, vector: Any, outside: frozenset[int]
+    model: Model, name: str, subsystem: SubsystemJacobians, vector: Any, outside: frozenset[int]
 ) -> tuple[Force, ...]:
     """Return the forces on the devices, as sums of hold outputs times factors."""
     peer_type = subsystem.peer_type
     if not outside:
         return ()
-    unit_of = {parameter.name: parameter.unit for parameter in system.parameters}
+    unit_of = {parameter.name: parameter.unit for parameter in model.parameters}
     x, u, p, t = peer_type.derivative.sx_in()
     slopes = jacobian(peer_type.derivative(x, u, p, t), u)
     varying = casadi.vertcat(x, u, t)
@@ -430,10 +430,10 @@ def _forces(
         if casadi.depends_on(axis, varying):
             message = f"{name}: the force on {state} is not a sum of values computed at ticks"
             advice = "use a motor without a limit; the real motor has one"
-            raise refused(system, message, code="E961", advice=advice)
+            raise refused(model, message, code="E961", advice=advice)
         device = find_device(subsystem, vector, unit_of, part=state)
         if not isinstance(device, Device):
-            raise refused(system, f"{name}: {device or f'{state} is not a mass'}", code="E961")
+            raise refused(model, f"{name}: {device or f'{state} is not a mass'}", code="E961")
         function = casadi.Function("slopes", [x, u, p, t], [casadi.densify(axis)])
         values = evaluate_exact(function, [numbers[0], numbers[1], numbers[4], numbers[5]])[0]
         terms = tuple((h, float(value / device.inverse)) for h, value in enumerate(values) if value)
@@ -455,9 +455,9 @@ def _transitions(
     vector: Any,
 ) -> tuple[Move, ...]:
     """Return the transitions of the computer's states for every interval length in quanta."""
-    system, index = plan.system, plan.system.groups[group].peer_type
+    model, index = plan.model, plan.model.groups[group].peer_type
     peer_type, subsystem, quantum = (
-        system.peer_types[index],
+        model.peer_types[index],
         plan.subsystems[index],
         plan.schedules[group].quantum,
     )
@@ -465,13 +465,13 @@ def _transitions(
     names = ", ".join(peer_type.states[row].name for row in flowing)
     if flowing and method.step is None:
         message = f"{name}: {names} are integrated by CVODES between ticks, which is not exported to C"
-        raise refused(system, message, STEPS)
+        raise refused(model, message, STEPS)
     if flowing and not peer_type.derivative.is_a("SXFunction"):
         message = f"{name}: the rates of {names} need an iteration, which is not exported to C"
-        raise refused(system, message, advice="write equations that can be solved for them")
-    groups_with_rows = zip(system.groups, plan.numbers.parameters, strict=True)
+        raise refused(model, message, advice="write equations that can be solved for them")
+    groups_with_rows = zip(model.groups, plan.numbers.parameters, strict=True)
     numbers = [row for item, rows in groups_with_rows if item.peer_type == index for row in rows]
-    flow = flow_of(peer_type, method, flowing, state_scales(system, peer_type, subsystem, numbers))
+    flow = flow_of(peer_type, method, flowing, state_scales(model, peer_type, subsystem, numbers))
     linear = rates(peer_type, [*sorted(outside), *flowing])
     if linear.timed:
         inputs = linear.rate.sx_in()
@@ -479,7 +479,7 @@ def _transitions(
         rows = [row for row in range(g.numel()) if casadi.depends_on(g[row], inputs[1])]
         pushed = ", ".join(peer_type.states[row].name for row in rows)
         message = f"{name}: the force on {pushed} depends on time between ticks"
-        raise refused(system, f"{message}; its exact integral is not exported to C", STEPS)
+        raise refused(model, f"{message}; its exact integral is not exported to C", STEPS)
     seconds = [length * quantum for length in lengths]
     matrices = transition_rows(linear, vector[None], seconds)
     moves = []
@@ -487,7 +487,7 @@ def _transitions(
         function = flow.over(duration) if flow is not None else None
         if function is not None and not function.is_a("SXFunction"):
             message = f"{name}: {names} need too many steps of {method} between two events"
-            raise refused(system, message, STEPS)
+            raise refused(model, message, STEPS)
         moves.append(Move(length, matrix[0], tuple(flowing), function))
     return tuple(moves)
 
@@ -521,8 +521,8 @@ def lines_of(
     plan: SimulationPlan, number: int
 ) -> tuple[tuple[PeerLink, ...], dict[tuple[int, int], tuple[int, ...]]]:
     """Return the links of a peer, and for each receive the indices of its channels in the packet."""
-    system, exchange, group = plan.system, plan.exchange, plan.exchange.group_of(number)
-    subsystem, schedule = plan.subsystems[system.groups[group].peer_type], plan.schedules[group]
+    model, exchange, group = plan.model, plan.exchange, plan.exchange.group_of(number)
+    subsystem, schedule = plan.subsystems[model.groups[group].peer_type], plan.schedules[group]
     peer_type = subsystem.peer_type
     read = {
         (event.partition, index): peer_type.clocks[event.partition].receives[index].link
@@ -545,7 +545,7 @@ def lines_of(
             continue
         index, send_partition = next(
             (index, send)
-            for each in (peer_type, *system.peer_types)
+            for each in (peer_type, *model.peer_types)
             for index, send in enumerate(each.sends)
             if send.link == link
         )
@@ -557,11 +557,11 @@ def lines_of(
         }
         channels = tuple(send_partition.channels[i] for i in used_channels)
         members = prefixed("value", channels)
-        senders = [*received_by(plan.system, plan.exchange, link, number)] if receives else []
+        senders = [*received_by(plan.model, plan.exchange, link, number)] if receives else []
         if len(senders) > MOST_RECEIVED:
             message = f"{exchange.peer_name(number)} receives from {len(senders):,} peers over {link}"
             message = f"{message}; the limit of the C export is {MOST_RECEIVED:,}"
-            raise refused(system, message, advice="reduce the number of peers, or use a sparse graph")
+            raise refused(model, message, advice="reduce the number of peers, or use a sparse graph")
         lines.append(
             PeerLink(
                 link=link,
@@ -585,7 +585,7 @@ def lines_of(
 
 def first_packet(plan: SimulationPlan, link: str, number: int, channels: Sequence[str]) -> tuple[float, ...]:
     """Return the values used for a sender before its first packet arrives, one per channel."""
-    subsystem = plan.subsystems[plan.system.groups[plan.exchange.group_of(number)].peer_type]
+    subsystem = plan.subsystems[plan.model.groups[plan.exchange.group_of(number)].peer_type]
     sent: dict[str, float] = {}
     for sending in subsystem.peer_type.sends:
         if sending.link == link:
@@ -597,7 +597,7 @@ def first_packet(plan: SimulationPlan, link: str, number: int, channels: Sequenc
 
 
 def received_by(
-    system: Model, exchange: CommunicationGraph, link: str, number: int
+    model: Model, exchange: CommunicationGraph, link: str, number: int
 ) -> Iterator[tuple[int, float]]:
     """Yield the senders to a peer over a link, with their weights, in the order of peers."""
     if exchange.is_complete(link):
@@ -606,7 +606,7 @@ def received_by(
         pairs, weights = exchange.arcs(link)
         own_rows = np.flatnonzero(pairs[:, 1] == number)
         senders = sorted(zip(pairs[own_rows, 0].tolist(), weights[own_rows].tolist(), strict=True))
-    peer_types = [system.peer_types[group.peer_type] for group in system.groups]
+    peer_types = [model.peer_types[group.peer_type] for group in model.groups]
     sends = [any(sending.link == link for sending in peer_type.sends) for peer_type in peer_types]
     return ((sender, weight) for sender, weight in senders if sends[exchange.group_of(sender)])
 

@@ -50,12 +50,12 @@ OPTION = "--symbolic"
 SPAN, TERMS = 64, 16
 
 
-def state_space_of(system: Model, *, open_at: str = "", symbolic: Sequence[str] = ()) -> StateSpace:
+def state_space_of(model: Model, *, open_at: str = "", symbolic: Sequence[str] = ()) -> StateSpace:
     """Return the state space of a model, with its matrices as a function of some parameters.
 
     Parameters
     ----------
-    system, open_at
+    model, open_at
         As for `lifted.state_space`.
     symbolic
         The names of parameters of the model or of a group; without any, the matrices are constant.
@@ -66,13 +66,13 @@ def state_space_of(system: Model, *, open_at: str = "", symbolic: Sequence[str] 
         E622 no such parameter; E954 a time, or a model whose slopes depend on its start; and those of
         `lifted.state_space`.
     """
-    space = state_space(system, open_at=open_at)
+    space = state_space(model, open_at=open_at)
     if not symbolic:
         return space
-    parameter_refs = _parameter_refs(system, symbolic)
-    ports = tuple(ExportedSignal(ref.label, unit_of(system, ref.name)) for ref in parameter_refs)
+    parameter_refs = _parameter_refs(model, symbolic)
+    ports = tuple(ExportedSignal(ref.label, unit_of(model, ref.name)) for ref in parameter_refs)
     symbols = [casadi.SX.sym(word) for word in words(ports)]
-    numeric = prepare_at_start(numeric_model(system), parameter_refs)
+    numeric = prepare_at_start(numeric_model(model), parameter_refs)
     if numeric is None:
         message = "the point of linearization depends on more than the parameters"
         raise ApcError(Diagnostic("E954", SourceLocation(OPTION), message, advice=f"omit {OPTION}"))
@@ -84,17 +84,17 @@ def state_space_of(system: Model, *, open_at: str = "", symbolic: Sequence[str] 
         """Return the parameters of a group's first peer as CasADi expressions."""
         index = exchange.group_of(group.peers.first)
         peer = group.peers.first - int(exchange.starts[index])
-        entries = free_values(system, system.groups[index], peer, values, symbolic_function)
+        entries = free_values(model, model.groups[index], peer, values, symbolic_function)
         return casadi.vertcat(*map(casadi.SX, entries))
 
-    blocks, _, _ = lifted(system, groups, exchange, open_at, _numbers(vector))
+    blocks, _, _ = lifted(model, groups, exchange, open_at, _numbers(vector))
     function = casadi.Function(
         "state_space", symbols, [*map(_matrix, blocks)], words(ports), ["A", "B", "C", "D"]
     )
     return replace(space, symbolic=ports, function=function)
 
 
-def _parameter_refs(system: Model, names: Sequence[str]) -> list[ParameterRef]:
+def _parameter_refs(model: Model, names: Sequence[str]) -> list[ParameterRef]:
     """Return references to the free parameters.
 
     Raises
@@ -104,13 +104,13 @@ def _parameter_refs(system: Model, names: Sequence[str]) -> list[ParameterRef]:
     """
     parameter_refs: list[ParameterRef] = []
     for name in names:
-        free = find(system, name, SourceLocation(OPTION))
-        if times_of(system, free.name):
+        free = find(model, name, SourceLocation(OPTION))
+        if times_of(model, free.name):
             message = f"{free.label} is a time; the event order and the states depend on it"
             advice = f'set single values with --set {free.label}="…"'
             raise ApcError(Diagnostic("E954", SourceLocation(OPTION), message, advice=advice))
-        refuse_channel_number(system, free, SourceLocation(OPTION))
-        if any(overlap(system, free, other) for other in parameter_refs):
+        refuse_channel_number(model, free, SourceLocation(OPTION))
+        if any(overlap(model, free, other) for other in parameter_refs):
             message = f"{free.label} is given twice"
             raise ApcError(Diagnostic("E954", SourceLocation(OPTION), message, fix=f"{OPTION} {free.label}"))
         parameter_refs.append(free)

@@ -159,7 +159,7 @@ def c_topology(plan: SimulationPlan, method: Method) -> CTopology:
     ApcError
         E960 too many directed peer pairs; and as `peer_of`, `arrival_process_of`.
     """
-    system, exchange = plan.system, plan.exchange
+    model, exchange = plan.model, plan.exchange
     total = exchange.peers * (exchange.peers - 1) if any(map(exchange.is_complete, exchange.links)) else 0
     if max(total, exchange.peers) > MOST_ARCS:
         message = (
@@ -167,7 +167,7 @@ def c_topology(plan: SimulationPlan, method: Method) -> CTopology:
             f"is {MOST_ARCS:,}"
         )
         alone = f'--peer "{exchange.peer_name(0)}"' if exchange.peers <= MOST_RECEIVED else ""
-        raise refused(system, message, alone)
+        raise refused(model, message, alone)
     first = subsystems_of(plan)
     subsystems = [*dict.fromkeys(first)]
     # The index of a subsystem keeps `a[1]` and `A[1]` distinct, and `a_1_link_b` of a link and a peer.
@@ -190,7 +190,7 @@ def c_topology(plan: SimulationPlan, method: Method) -> CTopology:
     ]
     variables.sort(key=lambda variable: not variable.given)
     links = _links(plan, quantum)
-    return CTopology(identifier(system.name), quantum, codes, tuple(peers), links, tuple(variables))
+    return CTopology(identifier(model.name), quantum, codes, tuple(peers), links, tuple(variables))
 
 
 def _links(plan: SimulationPlan, quantum: Fraction) -> tuple[CLink, ...]:
@@ -202,7 +202,7 @@ def _links(plan: SimulationPlan, quantum: Fraction) -> tuple[CLink, ...]:
         for line in lines_of(plan, peer)[0]:
             used.setdefault(line.link, {}).update(dict.fromkeys(line.channels))
             arcs.setdefault(line.link, []).extend((sender.peer, peer) for sender in line.senders)
-    clocks = {clock.name: clock for clock in plan.system.clocks}
+    clocks = {clock.name: clock for clock in plan.model.clocks}
     links = []
     for name, (link, channels) in zip(prefixed("link", used), used.items(), strict=True):
         names = [exchange.delay(link, *map(exchange.group_of, arc)) for arc in arcs[link]]
@@ -211,7 +211,7 @@ def _links(plan: SimulationPlan, quantum: Fraction) -> tuple[CLink, ...]:
         clock = clocks[declared.clock]
         period, phase = (int(timings[text] / quantum) for text in (clock.period, clock.phase))
         arrival_processes = [
-            (arrival_process_of(plan.system, timings, exchange, route, quantum), route)
+            (arrival_process_of(plan.model, timings, exchange, route, quantum), route)
             for route in plan.routes
             if route.link == link
         ]
@@ -231,11 +231,11 @@ def _links(plan: SimulationPlan, quantum: Fraction) -> tuple[CLink, ...]:
                 arcs=tuple(arcs[link]),
                 delays=tuple(delays),
                 arrival_process=arrival_processes[0][0] if arrival_processes else None,
-                laws=tuple(channel_law(plan.system, declared, name) for name in distinct)
+                laws=tuple(channel_law(plan.model, declared, name) for name in distinct)
                 if arrival_processes
                 else (),
                 law_of=tuple(map(distinct.index, names)),
-                key=stream_key(link, plan.system.experiment.seed, 0),
+                key=stream_key(link, plan.model.experiment.seed, 0),
                 stored=stored,
             )
         )

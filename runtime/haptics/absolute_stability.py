@@ -257,9 +257,9 @@ def _models_by_direction(numeric: NumericModel) -> dict[str, NumericModel]:
     ApcError
         E933 motions along different directions are coupled.
     """
-    system = without_hands(numeric.model, OPTION)
-    numeric = numeric if system is numeric.model else numeric_model(system)
-    along = directions_of(system)
+    model = without_hands(numeric.model, OPTION)
+    numeric = numeric if model is numeric.model else numeric_model(model)
+    along = directions_of(model)
     for loop in split(*lifted_classes(sides(numeric)[0].numeric)) if along else ():
         parts = load_pool("scipy.sparse.csgraph").connected_components(loop.matrix != 0, connection="weak")[1]
         axes_of_part: dict[str, set[str]] = {}
@@ -268,7 +268,7 @@ def _models_by_direction(numeric: NumericModel) -> dict[str, NumericModel]:
                 axes_of_part.setdefault(str(part_label), set()).add(axis)
         if any(len(axes) > 1 for axes in axes_of_part.values()):
             message = f"{OPTION}: devices move along several coupled axes ({', '.join(along)})"
-            raise ApcError(Diagnostic("E933", SourceLocation(system.origin.topology), message))
+            raise ApcError(Diagnostic("E933", SourceLocation(model.origin.topology), message))
     return {axis: numeric_model(part) for axis, part in along.items()} or {"": numeric}
 
 

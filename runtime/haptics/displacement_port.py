@@ -120,11 +120,11 @@ def port_loops(numeric: NumericModel, *, option: str) -> tuple[PortLoop, ...]:
     NotSupportedError
         The reason why no device is ever passive.
     """
-    system = numeric.model
+    model = numeric.model
     groups, exchange = lifted_classes(numeric)
     location, unit_of = (
-        SourceLocation(system.origin.topology),
-        {parameter.name: parameter.unit for parameter in system.parameters},
+        SourceLocation(model.origin.topology),
+        {parameter.name: parameter.unit for parameter in model.parameters},
     )
     received = {
         (receive.link, row)
@@ -134,7 +134,7 @@ def port_loops(numeric: NumericModel, *, option: str) -> tuple[PortLoop, ...]:
         if column.astype(np.bool_).any()
         for row in rows
     }
-    direct = coupled_directly(system.peer_types)
+    direct = coupled_directly(model.peer_types)
     device_inputs: dict[int, _DeviceInput] = {}
     with_inputs: list[PeerClass] = []
     for group in groups:
@@ -155,7 +155,7 @@ def port_loops(numeric: NumericModel, *, option: str) -> tuple[PortLoop, ...]:
         device_inputs[group.index] = device_input
         with_inputs.append(device_input.group)
     if not device_inputs:
-        raise no_device(system, option)
+        raise no_device(model, option)
     used = {received.coupling_term.link for group in groups for received in group.schedule.received}
     is_orthogonal = all(exchange.links[link].graph.shape in ORTHOGONAL for link in used)
     loops, weighted = accepted_loops(with_inputs, exchange, lambda _: is_orthogonal, option)

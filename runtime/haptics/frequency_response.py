@@ -149,12 +149,12 @@ def transparency(
         E931 a peer without a device; E934 an unstable model; E935 a frequency beyond half the fastest clock
         rate, or none above 0; E936 an unknown name; E933 a model too large.
     """
-    system = numeric.model
+    model = numeric.model
     result = np.asarray(frequencies, dtype=np.float64).ravel()
     device_names = [] if at else device_labels(numeric)
-    port = find_port(system, at or next(iter(device_names), ""), "--at")
-    other = find_port(system, between, "--between") if between else DevicePort(next_peer(system, port), "")
-    check_frequencies(system, result)
+    port = find_port(model, at or next(iter(device_names), ""), "--at")
+    other = find_port(model, between, "--between") if between else DevicePort(next_peer(model, port), "")
+    check_frequencies(model, result)
     optional = alongside is None
     norms = find_extension("system_norms") if optional else None
     if alongside is None:
@@ -163,8 +163,8 @@ def transparency(
         norms = require_extension("system_norms")
     verdict = judge(numeric)
     if verdict.stable is False and not unstable:
-        raise _unstable_error(system, verdict.spectral_radius)
-    with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
+        raise _unstable_error(model, verdict.spectral_radius)
+    with single_threaded(), finite_equations(model.origin.topology), np.errstate(all="ignore"):
         response = responses(numeric, port, other)
         s = np.asarray(2j * np.pi * result, dtype=np.complex128)
         driven, *aliases, transmitted, error = response.steady(s, ALIASES)
@@ -177,12 +177,12 @@ def transparency(
         is_stable = verdict.stable is not False
         quasi_static = _quasi_static(response) if "low_frequency" in alongside else None
         viscosity = (
-            _network_part_of_damping(norms, system, quasi_static, port, other)
+            _network_part_of_damping(norms, model, quasi_static, port, other)
             if norms and quasi_static and "network_damping" in alongside
             else None
         )
         hinf = norms.hinf_gains(response, result) if norms and "hinf" in alongside else ()
-        h2 = norms.h2_gains(system, response) if norms and is_stable and "h2" in alongside else ()
+        h2 = norms.h2_gains(model, response) if norms and is_stable and "h2" in alongside else ()
     linear = is_linear(numeric)
     driven_name, other_name = (
         f"{response.exchange.peer_name(item.peer)}.{device.part}"
@@ -201,7 +201,7 @@ def transparency(
         Limitation(LimitationCode.CLOCK_PHASE): is_stable and not h2 and "h2" in alongside,
     }
     return Transparency(
-        topology=system.name,
+        topology=model.name,
         at=driven_name,
         between="" if other_name == driven_name else other_name,
         object=response.object,
@@ -219,14 +219,14 @@ def transparency(
         h2=h2,
         stable=verdict.stable,
         linearized=not linear,
-        at_equilibrium=system.at_equilibrium,
-        limitations=(*near_start(numeric), *limitations(system)),
+        at_equilibrium=model.at_equilibrium,
+        limitations=(*near_start(numeric), *limitations(model)),
         notes=tuple(limitation for limitation, applies in applicable.items() if applies),
     )
 
 
 def _network_part_of_damping(
-    norms: Any, system: Model, slow: QuasiStaticImpedance, port: DevicePort, other: DevicePort
+    norms: Any, model: Model, slow: QuasiStaticImpedance, port: DevicePort, other: DevicePort
 ) -> NetworkDamping | None:
     """Return the part of the quasi-static damping that is caused by the network, None if undetermined."""
 
@@ -235,17 +235,17 @@ def _network_part_of_damping(
         slow = _quasi_static(responses(numeric_model(changed), port, other))
         return None if slow is None else (slow.damping, slow.errors[1])
 
-    result: NetworkDamping | None = norms.network_damping(system, (slow.damping, slow.errors[1]), damping_of)
+    result: NetworkDamping | None = norms.network_damping(model, (slow.damping, slow.errors[1]), damping_of)
     return result
 
 
-def _unstable_error(system: Model, radius: float) -> ApcError:
+def _unstable_error(model: Model, radius: float) -> ApcError:
     """Return the error E934 for an unstable model."""
     message = (
         f"the topology is unstable (spectral radius {radius:.6g}) and has no steady-state frequency response"
     )
     fix = "--unstable"
-    return ApcError(Diagnostic("E934", SourceLocation(system.origin.topology), message, fix=fix))
+    return ApcError(Diagnostic("E934", SourceLocation(model.origin.topology), message, fix=fix))
 
 
 def _quasi_static(response: Responses) -> QuasiStaticImpedance | None:

@@ -68,10 +68,10 @@ def responses(numeric: NumericModel, port: DevicePort, other: DevicePort) -> Res
     ApcError
         E931 a peer without a device; E933 a model too large.
     """
-    system = numeric.model
+    model = numeric.model
     groups, exchange = lifted_classes(numeric)
-    unit_of = {parameter.name: parameter.unit for parameter in system.parameters}
-    direct = coupled_directly(system.peer_types)
+    unit_of = {parameter.name: parameter.unit for parameter in model.parameters}
+    direct = coupled_directly(model.peer_types)
     driven_classes, subsystems, gripped = [], {}, {}
     for group in groups:
         device = None
@@ -86,7 +86,7 @@ def responses(numeric: NumericModel, port: DevicePort, other: DevicePort) -> Res
                 group.jacobians, group.parameters, unit_of, group.initial_reception, direct=direct
             )
             device = result if isinstance(result, Device) else None
-        _check_increments(system, group)
+        _check_increments(model, group)
         peer_group, subsystem = driven_subsystem(group, device)
         driven_classes.append(peer_group)
         subsystems[peer_group.index] = subsystem
@@ -100,7 +100,7 @@ def responses(numeric: NumericModel, port: DevicePort, other: DevicePort) -> Res
         advice = f"reduce the number of different peers (limit: {MOST_TOGETHER:,})"
         raise ApcError(
             Diagnostic(
-                "E933", SourceLocation(system.origin.topology), f"apc transparency: {message}", advice=advice
+                "E933", SourceLocation(model.origin.topology), f"apc transparency: {message}", advice=advice
             )
         )
     driven_index, other_index = (
@@ -150,12 +150,12 @@ def device_labels(numeric: NumericModel) -> list[str]:
 
     Such as `left[1].device`.
     """
-    system = numeric.model
-    unit_of, numbers = {parameter.name: parameter.unit for parameter in system.parameters}, numeric.numbers
-    direct = coupled_directly(system.peer_types)
+    model = numeric.model
+    unit_of, numbers = {parameter.name: parameter.unit for parameter in model.parameters}, numeric.numbers
+    direct = coupled_directly(model.peer_types)
     return [
         f"{group.name}[1].{part}"
-        for index, group in enumerate(system.groups)
+        for index, group in enumerate(model.groups)
         for part, result in find_devices(
             numeric.jacobians[group.peer_type], numbers.parameters[index][0], unit_of, direct=direct
         ).items()
@@ -163,13 +163,13 @@ def device_labels(numeric: NumericModel) -> list[str]:
     ]
 
 
-def _check_increments(system: Model, group: PeerClass) -> None:
+def _check_increments(model: Model, group: PeerClass) -> None:
     """Raise ApcError E933 for a peer with too many events and states in a frame."""
     forced_increments = len(group.schedule.events) * len(group.subsystem.a)
     if forced_increments > MOST_INCREMENTS:
         message = f"a frame of {group.name} has {forced_increments:,} events and states"
         advice = f"use at most {MOST_INCREMENTS:,} events and states"
-        raise ApcError(Diagnostic("E933", SourceLocation(system.origin.topology), message, advice=advice))
+        raise ApcError(Diagnostic("E933", SourceLocation(model.origin.topology), message, advice=advice))
 
 
 def _are_by_class(loops: Sequence[ModalSystem]) -> bool:

@@ -20,21 +20,21 @@ MOVING = 2  # states of a device of one degree of freedom
 _SCALES = {"ms": 1e3}  # factors from SI to the units of symbols
 
 
-def published_limits(system: Model) -> tuple[str, ...]:
+def published_limits(model: Model) -> tuple[str, ...]:
     """Return one sentence for each published condition that applies to a wall and a quantized position.
 
     Parameters
     ----------
-    system
+    model
         The compiled model.
     """
-    if system.links or not any(peer_type.symbols for peer_type in system.peer_types):
+    if model.links or not any(peer_type.symbols for peer_type in model.peer_types):
         return ()
-    numbers = resolve(system)
+    numbers = resolve(model)
     lines = [
         line
-        for index, group in enumerate(system.groups)
-        for line in _conditions_of_group(system.peer_types[group.peer_type], numbers, index)
+        for index, group in enumerate(model.groups)
+        for line in _conditions_of_group(model.peer_types[group.peer_type], numbers, index)
     ]
     return tuple(dict.fromkeys(lines))
 

@@ -41,14 +41,14 @@ def loaded_model(archive: Archive, folder: Path) -> Model:
     from apc.compiler.pipeline import compile_again
     from apc.lifting.start_checks import check_values
 
-    system = compile_again(archive.origin, folder)
-    check_values(system)
+    model = compile_again(archive.origin, folder)
+    check_values(model)
     for change in archive.origin.changes:
-        system = _reapplied(system, change)
-    return system
+        model = _reapplied(model, change)
+    return model
 
 
-def _reapplied(system: Model, change: Sequence[tuple[str, str]]) -> Model:
+def _reapplied(model: Model, change: Sequence[tuple[str, str]]) -> Model:
     """Return a model after a change recorded in the origin. Raises ApcError if the change is impossible."""
     from apc.lifting.devices import with_hands
     from apc.lifting.rest_position import operating_point_from
@@ -57,8 +57,8 @@ def _reapplied(system: Model, change: Sequence[tuple[str, str]]) -> Model:
 
     for name, value in change:
         if name == HANDS_CHANGE:
-            return with_hands(system, value)
+            return with_hands(model, value)
         if name == EQUILIBRIUM_CHANGE:  # from the start values, wherever the search began
-            return operating_point_from(system).model
-    pairs = [(find(system, name, counts=True), Fraction(value)) for name, value in change]
-    return apply(system, [Override(free, value) for free, value in pairs])
+            return operating_point_from(model).model
+    pairs = [(find(model, name, counts=True), Fraction(value)) for name, value in change]
+    return apply(model, [Override(free, value) for free, value in pairs])

@@ -115,9 +115,9 @@ def load_or_compile(path: Path) -> Model:
     from apc.compiler.pipeline import compile_topology
     from apc.lifting.start_checks import check_values
 
-    system = compile_topology(path)
-    check_values(system)
-    return system
+    model = compile_topology(path)
+    check_values(model)
+    return model
 
 
 @part("read")
@@ -158,36 +158,36 @@ def open_topology(
         `rest_position.linearized_at`.
     """
     path = find_input(file, compiled_too=True)
-    system = load_or_compile(path)
-    check_outputs(path, (name for name, _ in system.origin.texts), outputs or {})
+    model = load_or_compile(path)
+    check_outputs(path, (name for name, _ in model.origin.texts), outputs or {})
     if hands != "free":
         from apc.lifting.devices import refuse_numberless, with_hands
 
-        system = with_hands(system, hands)
+        model = with_hands(model, hands)
         refuse_numberless(hands, (*settings, *varied))
     if settings:
-        system = _with_settings(system, settings, notify)
+        model = _with_settings(model, settings, notify)
     if operating_point != "start":
         from apc.lifting.rest_position import linearized_at
 
-        system = linearized_at(system, operating_point)
-    return system
+        model = linearized_at(model, operating_point)
+    return model
 
 
-def _with_settings(system: Model, settings: Sequence[str], notify: Callable[[str], None] | None) -> Model:
+def _with_settings(model: Model, settings: Sequence[str], notify: Callable[[str], None] | None) -> Model:
     """Return a model with the settings of a command; arguments and errors as in `open_topology`."""
     from apc.parameter_values.overrides import apply, parse_override
     from apc.parameter_values.parameter_names import OVERRIDE, notes_for_all_groups
 
-    overrides = [parse_override(system, text) for text in settings]
+    overrides = [parse_override(model, text) for text in settings]
     for index, override in enumerate(overrides):
         if any(override.free == other.free for other in overrides[:index]):
             message, fix = f"two values of {override.free.label}", f'--set "{settings[index]}"'
             raise ApcError(Diagnostic("E621", OVERRIDE, message, fix=fix))
     if notify is not None:
-        for note in notes_for_all_groups(system, [override.free for override in overrides]):
+        for note in notes_for_all_groups(model, [override.free for override in overrides]):
             notify(note)
-    return apply(system, overrides)
+    return apply(model, overrides)
 
 
 def refuse_model(path: Path, command: str) -> None:

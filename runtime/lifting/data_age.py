@@ -37,9 +37,9 @@ STAMP = "time"  # the channel with the time of sending
 _Ages = tuple[tuple[str, Fraction], ...]  # of one tick, by link
 
 
-def aged(system: Model) -> bool:
+def aged(model: Model) -> bool:
     """Return whether an equation of a model contains the age of a received value."""
-    return any(map(_receives_ages, system.peer_types))
+    return any(map(_receives_ages, model.peer_types))
 
 
 def _receives_ages(peer_type: PeerType) -> bool:
@@ -51,19 +51,19 @@ def _receives_ages(peer_type: PeerType) -> bool:
 
 
 def linear_subsystems(
-    system: Model, timings: Mapping[str, Fraction] | None = None, order: Sequence[str] = ORDER
+    model: Model, timings: Mapping[str, Fraction] | None = None, order: Sequence[str] = ORDER
 ) -> tuple[SubsystemJacobians, ...]:
     """Return the Jacobians of each peer type of `nominal`, by default with the model's own timings."""
-    return tuple(jacobians(peer_type) for peer_type in nominal(system, timings, order).peer_types)
+    return tuple(jacobians(peer_type) for peer_type in nominal(model, timings, order).peer_types)
 
 
-def of_single_delay(system: Model) -> Model:
+def of_single_delay(model: Model) -> Model:
     """Return a model in which all pairs have the delay of their link, so that each tick has one age."""
-    return replace(system, links=tuple(replace(link, pairs=()) for link in system.links))
+    return replace(model, links=tuple(replace(link, pairs=()) for link in model.links))
 
 
 def at_timings(
-    system: Model,
+    model: Model,
     subsystems: tuple[SubsystemJacobians, ...],
     timings: Mapping[str, Fraction],
     order: Sequence[str],
@@ -74,16 +74,16 @@ def at_timings(
 
     Parameters
     ----------
-    system, subsystems
+    model, subsystems
         The compiled model, and its Jacobians at its own timings.
     timings, order
         Seconds by the name of the timing, and the order of coincident events.
     """
-    return linear_subsystems(system, timings, order) if aged(system) else subsystems
+    return linear_subsystems(model, timings, order) if aged(model) else subsystems
 
 
 def nominal(
-    system: Model, timings: Mapping[str, Fraction] | None = None, order: Sequence[str] = ORDER
+    model: Model, timings: Mapping[str, Fraction] | None = None, order: Sequence[str] = ORDER
 ) -> Model:
     """Return the peer types of a linear analysis, with the ages of each tick on a nominal network.
 
@@ -91,7 +91,7 @@ def nominal(
 
     Parameters
     ----------
-    system
+    model
         The compiled model.
     timings
         Seconds by the name of the timing; by default the model's own.
@@ -103,27 +103,25 @@ def nominal(
     ApcError
         E811 peers of one type that receive packets of several ages at one tick.
     """
-    system = replace(
-        system, peer_types=tuple(peer_type.linear or peer_type for peer_type in system.peer_types)
-    )
-    if not aged(system):
-        return system
+    model = replace(model, peer_types=tuple(peer_type.linear or peer_type for peer_type in model.peer_types))
+    if not aged(model):
+        return model
     if timings is None:
-        timings = {timing.name: timing.value for timing in system.timings}
-    exchange = build_exchange(system, timings)
+        timings = {timing.name: timing.value for timing in model.timings}
+    exchange = build_exchange(model, timings)
     peer_types = []
-    for number, peer_type in enumerate(system.peer_types):
+    for number, peer_type in enumerate(model.peer_types):
         partitions = [
-            _ages_of_ticks(system, exchange, timings, number, clock, order) for clock in peer_type.clocks
+            _ages_of_ticks(model, exchange, timings, number, clock, order) for clock in peer_type.clocks
         ]
         peer_types.append(
             _with_known_ages(peer_type, tuple(partitions)) if _receives_ages(peer_type) else peer_type
         )
-    return replace(system, peer_types=tuple(peer_types))
+    return replace(model, peer_types=tuple(peer_types))
 
 
 def _ages_of_ticks(
-    system: Model,
+    model: Model,
     exchange: CommunicationGraph,
     timings: Mapping[str, Fraction],
     peer_type_index: int,
@@ -134,7 +132,7 @@ def _ages_of_ticks(
 
     Parameters
     ----------
-    system, exchange, timings
+    model, exchange, timings
         The compiled model, its communication graph, and seconds by the name of the timing.
     peer_type_index, partition
         The index of the peer type, and its clock partition.
@@ -144,10 +142,10 @@ def _ages_of_ticks(
     links = list(dict.fromkeys(receive.link for receive in partition.receives if receive.age))
     if not links:
         return ()
-    clock_of = {clock.name: clock for clock in system.clocks}
+    clock_of = {clock.name: clock for clock in model.clocks}
     delay_by_link, clock_by_link = dict[str, Fraction](), dict[str, str]()
     for link in links:
-        delay_name = _single_delay(system, exchange, timings, peer_type_index, link)
+        delay_name = _single_delay(model, exchange, timings, peer_type_index, link)
         delay_by_link[link] = timings[delay_name]
         clock_by_link[link] = exchange.links[link].clock_at(delay_name)
     names = [partition.clock, *clock_by_link.values()]
@@ -173,7 +171,7 @@ def _ages_of_ticks(
 
 
 def _single_delay(
-    system: Model,
+    model: Model,
     exchange: CommunicationGraph,
     timings: Mapping[str, Fraction],
     peer_type_index: int,
@@ -186,23 +184,21 @@ def _single_delay(
     ApcError
         E811 several delays, or packets at several clocks.
     """
-    receivers = [index for index, group in enumerate(system.groups) if group.peer_type == peer_type_index]
+    receivers = [index for index, group in enumerate(model.groups) if group.peer_type == peer_type_index]
     delay_names = {
         exchange.delay(link, sender, receiver)
         for receiver in receivers
-        for sender in range(len(system.groups))
-        if sender != receiver or system.groups[sender].count > 1
+        for sender in range(len(model.groups))
+        if sender != receiver or model.groups[sender].count > 1
     }
     delay_names = delay_names or {exchange.default_delay[link]}
     if len({(timings[name], exchange.links[link].clock_at(name)) for name in delay_names}) > 1:
         names = ", ".join(sorted(delay_names))
         message = (
-            f"the age of samples received by {system.peer_types[peer_type_index].name} over {link} differs "
+            f"the age of samples received by {model.peer_types[peer_type_index].name} over {link} differs "
             f"between senders ({names}); different ages can be simulated but not analyzed"
         )
-        raise ApcError(
-            Diagnostic("E811", SourceLocation(system.origin.topology), message, fix="apc simulate")
-        )
+        raise ApcError(Diagnostic("E811", SourceLocation(model.origin.topology), message, fix="apc simulate"))
     return min(delay_names)
 
 
@@ -289,15 +285,15 @@ def _receive_at_age(receive: Receive, age: Fraction) -> Receive:
 # ---- every packet contains its time of sending ----
 
 
-def stamped(system: Model) -> Model:
+def stamped(model: Model) -> Model:
     """Return a model whose packets contain time stamps, from which its ages are computed.
 
     For each channel that is weighted by its age, a second channel sends the product with the time of sending.
     """
-    if not aged(system):
-        return system
+    if not aged(model):
+        return model
     channels_by_link: dict[str, dict[str, None]] = {}
-    for peer_type in system.peer_types:
+    for peer_type in model.peer_types:
         channels = {sending.link: sending.channels for sending in peer_type.sends}
         for receive in (
             receive for partition in peer_type.clocks for receive in partition.receives if receive.age
@@ -306,8 +302,8 @@ def stamped(system: Model) -> Model:
             channels_by_link.setdefault(receive.link, {})[channel] = None
     stamped_channels = tuple((link, tuple(names)) for link, names in channels_by_link.items())
     return replace(
-        system,
-        peer_types=tuple(_stamped_peer_type(peer_type, stamped_channels) for peer_type in system.peer_types),
+        model,
+        peer_types=tuple(_stamped_peer_type(peer_type, stamped_channels) for peer_type in model.peer_types),
     )
 
 

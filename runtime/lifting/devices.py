@@ -381,12 +381,12 @@ def _inverse(peer_type: PeerType, velocity: int, mass: int, column: int, peers: 
     )
 
 
-def devices_of(system: Model, *, option: str) -> dict[int, Device]:
+def devices_of(model: Model, *, option: str) -> dict[int, Device]:
     """Return the device of each peer type that has one, by index; a server without a device is left out.
 
     Parameters
     ----------
-    system
+    model
         The compiled model.
     option
         The option that requires devices, for messages.
@@ -396,68 +396,68 @@ def devices_of(system: Model, *, option: str) -> dict[int, Device]:
     ApcError
         E931 no peer has a device, or one has several possible devices.
     """
-    unit_of = {parameter.name: parameter.unit for parameter in system.parameters}
-    numbers, direct = resolve(system), coupled_directly(system.peer_types)
+    unit_of = {parameter.name: parameter.unit for parameter in model.parameters}
+    numbers, direct = resolve(model), coupled_directly(model.peer_types)
     result: dict[int, Device] = {}
-    for index, group in enumerate(system.groups):
-        subsystem = jacobians(analyzed(system.peer_types[group.peer_type]))
+    for index, group in enumerate(model.groups):
+        subsystem = jacobians(analyzed(model.peer_types[group.peer_type]))
         device = find_device(subsystem, numbers.parameters[index][0], unit_of, direct=direct)
         if isinstance(device, str):
             candidates = find_devices(subsystem, numbers.parameters[index][0], unit_of, direct=direct)
-            fix = _hand_entry(system, subsystem.peer_type, candidates)
+            fix = _hand_entry(model, subsystem.peer_type, candidates)
             raise ApcError(
-                Diagnostic("E931", SourceLocation(system.origin.topology), f"{option}: {device}", fix=fix)
+                Diagnostic("E931", SourceLocation(model.origin.topology), f"{option}: {device}", fix=fix)
             )
         if device is not None:
             result.setdefault(group.peer_type, device)
     if not result:
-        raise no_device(system, option)
+        raise no_device(model, option)
     return result
 
 
-def _hand_entry(system: Model, peer_type: PeerType, candidates: Mapping[str, Device | str]) -> str:
+def _hand_entry(model: Model, peer_type: PeerType, candidates: Mapping[str, Device | str]) -> str:
     """Return a topology entry that connects a hand to the first of several possible devices, or ""."""
     part = next((part_name for part_name, device in candidates.items() if isinstance(device, Device)), "")
     if peer_type.held or len(candidates) < 2 or not part or part.endswith("]"):
         return ""
     having = [
         group.name
-        for group in system.groups
-        if any(_part(state.name) == part for state in system.peer_types[group.peer_type].states)
+        for group in model.groups
+        if any(_part(state.name) == part for state in model.peer_types[group.peer_type].states)
     ]
-    group_list = f", at: [{', '.join(having)}]" if len(having) < len(system.groups) else ""
+    group_list = f", at: [{', '.join(having)}]" if len(having) < len(model.groups) else ""
     return _HOLDS.format(part=part, at=group_list)
 
 
-def directions_of(system: Model) -> dict[str, Model]:
+def directions_of(model: Model) -> dict[str, Model]:
     """Return one model for each direction in which devices move, with all other directions clamped.
 
     The result is empty if each device moves along one line only.
 
     Parameters
     ----------
-    system
+    model
         The compiled model.
     """
-    unit_of = {parameter.name: parameter.unit for parameter in system.parameters}
-    numbers, direct = resolve(system), coupled_directly(system.peer_types)
+    unit_of = {parameter.name: parameter.unit for parameter in model.parameters}
+    numbers, direct = resolve(model), coupled_directly(model.peer_types)
     axis_names: dict[str, None] = {}
-    for index, group in enumerate(system.groups):
-        subsystem = jacobians(analyzed(system.peer_types[group.peer_type]))
+    for index, group in enumerate(model.groups):
+        subsystem = jacobians(analyzed(model.peer_types[group.peer_type]))
         result = find_devices(subsystem, numbers.parameters[index][0], unit_of, direct=direct)
         axes = {part_name: device for part_name, device in result.items() if isinstance(device, Device)}
         wholes = {whole_and_index(axis)[0] if axis.endswith("]") else "" for axis in axes}
         if len(axes) == len(result) > 1 and len(wholes) == 1 and "" not in wholes:
             axis_names |= dict.fromkeys(axis.rpartition(".")[2] for axis in axes)
     return {
-        axis: _with_clamped_axes(system, [text for text in axis_names if text != axis]) for axis in axis_names
+        axis: _with_clamped_axes(model, [text for text in axis_names if text != axis]) for axis in axis_names
     }
 
 
-def _with_clamped_axes(system: Model, others: Sequence[str]) -> Model:
+def _with_clamped_axes(model: Model, others: Sequence[str]) -> Model:
     """Return a model in which the given axes of the devices are clamped at their start."""
     peer_types = []
-    for peer_type in system.peer_types:
+    for peer_type in model.peer_types:
         moving = [
             (index, int(driven[0]))
             for index, state in enumerate(peer_type.states)
@@ -472,31 +472,31 @@ def _with_clamped_axes(system: Model, others: Sequence[str]) -> Model:
             index = {state.name: number for number, state in enumerate(peer_type.states)}
             peer_type = _with_clamped_device(peer_type, *(index[name] for name in pair))
         peer_types.append(peer_type)
-    return replace(system, peer_types=tuple(peer_types))
+    return replace(model, peer_types=tuple(peer_types))
 
 
-def no_device(system: Model, option: str) -> ApcError:
+def no_device(model: Model, option: str) -> ApcError:
     """Return the error for a model in which no peer has a device."""
-    names = ", ".join(group.name for group in system.groups)
+    names = ", ".join(group.name for group in model.groups)
     message = f"{option}: no device at {names}: each mass is a copy of a shared object"
-    return ApcError(Diagnostic("E931", SourceLocation(system.origin.topology), message, fix=LOCAL_MASS))
+    return ApcError(Diagnostic("E931", SourceLocation(model.origin.topology), message, fix=LOCAL_MASS))
 
 
-def refuse_hands(system: Model, option: str) -> None:
+def refuse_hands(model: Model, option: str) -> None:
     """Raise ApcError E932 if a model has hands already."""
-    for group in system.groups:
-        for hand in system.peer_types[group.peer_type].hands:
+    for group in model.groups:
+        for hand in model.peer_types[group.peer_type].hands:
             message = f"{option}: {group.name} already has the hand {hand}"
             advice = f"remove {hand} from the topology, or omit {option}"
-            raise ApcError(Diagnostic("E932", SourceLocation(system.origin.topology), message, advice=advice))
+            raise ApcError(Diagnostic("E932", SourceLocation(model.origin.topology), message, advice=advice))
 
 
-def without_hands(system: Model, option: str) -> Model:
+def without_hands(model: Model, option: str) -> Model:
     """Return a model without the hands of its topology.
 
     Parameters
     ----------
-    system
+    model
         The compiled model.
     option
         The option that requires devices, for messages.
@@ -506,15 +506,15 @@ def without_hands(system: Model, option: str) -> Model:
     ApcError
         E932 a hand is more than a mass, damper and spring between a device and its rest position.
     """
-    if not any(peer_type.hands for peer_type in system.peer_types):
-        return system
-    unit_of = {parameter.name: parameter.unit for parameter in system.parameters}
+    if not any(peer_type.hands for peer_type in model.peer_types):
+        return model
+    unit_of = {parameter.name: parameter.unit for parameter in model.parameters}
     peer_types = tuple(
         _without_hands(peer_type, tuple(map(unit_of.get, peer_type.parameters)))
-        for peer_type in system.peer_types
+        for peer_type in model.peer_types
     )
-    bare = tuple(item or peer_type for item, peer_type in zip(peer_types, system.peer_types, strict=True))
-    compiled_system = replace(system, peer_types=bare)
+    bare = tuple(item or peer_type for item, peer_type in zip(peer_types, model.peer_types, strict=True))
+    compiled_system = replace(model, peer_types=bare)
     refuse_hands(compiled_system, option)
     return compiled_system
 
@@ -558,22 +558,22 @@ def _belongs_to_hand(name: str, hand: str) -> bool:
     return name.startswith(f"{hand}.") or _part(name) == hand
 
 
-def replaced_hands(system: Model) -> tuple[str, ...]:
+def replaced_hands(model: Model) -> tuple[str, ...]:
     """Return a note on the hands of the topology, which are replaced; empty if it has no hands."""
     names = [
         f"{hand} of {group.name}"
-        for group in system.groups
-        for hand in system.peer_types[group.peer_type].hands
+        for group in model.groups
+        for hand in model.peer_types[group.peer_type].hands
     ]
     return (f"{', '.join(names)}: replaced by any passive operator",) if names else ()
 
 
-def with_hands(system: Model, hands: str) -> Model:
+def with_hands(model: Model, hands: str) -> Model:
     """Return a model with the requested hands; its name includes them.
 
     Parameters
     ----------
-    system
+    model
         The compiled model.
     hands
         "free": unchanged. "clamped": devices are clamped. "held": a hand of `hand.mass`, `hand.damping` and
@@ -587,20 +587,20 @@ def with_hands(system: Model, hands: str) -> Model:
     """
     option = f"--hands {hands}"
     if hands in (FREE, PASSIVE):
-        return system
+        return model
     if hands == CLAMPED:
-        compiled_system, name = clamped(system, option=option), "devices clamped"
+        compiled_system, name = clamped(model, option=option), "devices clamped"
     elif hands in HANDS:
-        compiled_system, name = gripped(system, option=option), "devices held"
+        compiled_system, name = gripped(model, option=option), "devices held"
     else:
         typical = {name: numbers[2] for name, numbers in published(hands).items()}
-        compiled_system, name = gripped(system, option=option), f"hands {hands}"
+        compiled_system, name = gripped(model, option=option), f"hands {hands}"
         compiled_system = apply(
             compiled_system,
             [parse_override(compiled_system, f"{name}={value}") for name, value in typical.items()],
         )
     return replace(
-        compiled_system, name=f"{system.name}, {name}", origin=system.origin.after((HANDS_CHANGE, hands))
+        compiled_system, name=f"{model.name}, {name}", origin=model.origin.after((HANDS_CHANGE, hands))
     )
 
 
@@ -632,7 +632,7 @@ def refuse_numberless(hands: str, named: Iterable[str]) -> None:
     raise ApcError(Diagnostic("E930", SourceLocation("--hands"), message, f"a value for {names}", got, fix))
 
 
-def clamped(system: Model, *, option: str = "--hands clamped") -> Model:
+def clamped(model: Model, *, option: str = "--hands clamped") -> Model:
     """Return a model whose devices are clamped at their start.
 
     Raises
@@ -640,18 +640,18 @@ def clamped(system: Model, *, option: str = "--hands clamped") -> Model:
     ApcError
         E931 as `devices_of`, E932 as `without_hands`.
     """
-    system = without_hands(system, option)
+    model = without_hands(model, option)
     # For devices that move along several directions all directions but one are clamped first.
-    system = next(iter(directions_of(system).values()), system)
-    devices = devices_of(system, option=option)
-    peer_types = list(system.peer_types)
+    model = next(iter(directions_of(model).values()), model)
+    devices = devices_of(model, option=option)
+    peer_types = list(model.peer_types)
     for peer_type_index, device in devices.items():
         peer_type = peer_types[peer_type_index]
         peer_types[peer_type_index] = _with_clamped_device(peer_type, device.position, device.velocity)
-    return replace(system, peer_types=tuple(peer_types))
+    return replace(model, peer_types=tuple(peer_types))
 
 
-def gripped(system: Model, *, option: str) -> Model:
+def gripped(model: Model, *, option: str) -> Model:
     """Return a model with a hand on every device.
 
     Mass, damping and stiffness of the hand are parameters with the value 0.
@@ -661,10 +661,10 @@ def gripped(system: Model, *, option: str) -> Model:
     ApcError
         E931 as `devices_of`, E932 hands in the topology.
     """
-    refuse_hands(system, option)
-    devices = devices_of(system, option=option)
+    refuse_hands(model, option)
+    devices = devices_of(model, option=option)
     names = tuple(f"{HAND}.{name}" for name, _, _ in _NUMBERS)
-    peer_types = list(system.peer_types)
+    peer_types = list(model.peer_types)
     for number, device in devices.items():
         peer_types[number] = _with_hand(
             peer_types[number], device.position, device.velocity, device.symbolic, names
@@ -673,7 +673,7 @@ def gripped(system: Model, *, option: str) -> Model:
         Parameter(name, unit, 0.0, minimum=0.0, description=description)
         for name, (_, unit, description) in zip(names, _NUMBERS, strict=True)
     )
-    return replace(system, peer_types=tuple(peer_types), parameters=(*system.parameters, *added))
+    return replace(model, peer_types=tuple(peer_types), parameters=(*model.parameters, *added))
 
 
 @functools.lru_cache(maxsize=64)

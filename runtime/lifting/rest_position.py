@@ -88,12 +88,12 @@ class OperatingPoint(Result):
     model: Model
 
 
-def linearized_at(system: Model, operating_point: str) -> Model:
+def linearized_at(model: Model, operating_point: str) -> Model:
     """Return the model of an operating point: linearized at its start values, or at its equilibrium.
 
     Parameters
     ----------
-    system
+    model
         The compiled model.
     operating_point
         One of `OPERATING_POINTS`.
@@ -108,30 +108,30 @@ def linearized_at(system: Model, operating_point: str) -> Model:
         location = SourceLocation("operating point")
         raise ApcError(Diagnostic("E840", location, "operating point", expected, operating_point[:40]))
     if operating_point == START:
-        return system
-    changed = replace(system, at_equilibrium=True)
+        return model
+    changed = replace(model, at_equilibrium=True)
     operating_point_from(changed)
     return changed
 
 
-def equilibrium_moves(system: Model, varied: Sequence[ParameterRef]) -> bool:
+def equilibrium_moves(model: Model, varied: Sequence[ParameterRef]) -> bool:
     """Return whether some parameter may change the equilibrium of a model: all except times alone."""
     numbers = np.array([1.0, 2.0])
     for ref in varied:
-        if aged(system) or not times_of(system, ref.name):
+        if aged(model) or not times_of(model, ref.name):
             return True
-        groups = [group for group in system.groups if ref.group in (None, group.name)]
+        groups = [group for group in model.groups if ref.group in (None, group.name)]
         with np.errstate(all="ignore"):
-            if any(len(free_rows(system, group, 0, {ref: numbers})) > 1 for group in groups):
+            if any(len(free_rows(model, group, 0, {ref: numbers})) > 1 for group in groups):
                 return True
     return False
 
 
-def equilibrium_note(system: Model) -> tuple[str, ...]:
+def equilibrium_note(model: Model) -> tuple[str, ...]:
     """Return the positions of the equilibrium in one line; empty for a model linearized at its start."""
-    if not system.at_equilibrium:
+    if not model.at_equilibrium:
         return ()
-    positions = operating_point_from(system).positions
+    positions = operating_point_from(model).positions
     shown = [f"{position.name} = {position.text}" for position in positions[:MOST_NOTED]]
     return (
         f"equilibrium at the present values: {', '.join([*shown, *['…'][: len(positions) - MOST_NOTED]])}",
@@ -139,24 +139,24 @@ def equilibrium_note(system: Model) -> tuple[str, ...]:
     )
 
 
-def at_equilibrium(system: Model) -> Model:
+def at_equilibrium(model: Model) -> Model:
     """Return a nonlinear model with the equilibrium as its start values; a linear model unchanged.
 
     The linearization of a linear model is the same at every point.
     """
-    numeric = _at_start(with_start_parameters(system))
-    return system if numeric.affine else operating_point_from(system).model
+    numeric = _at_start(with_start_parameters(model))
+    return model if numeric.affine else operating_point_from(model).model
 
 
 @part("equilibrium")
 def operating_point_from(
-    system: Model, start: Mapping[str, float] | None = None, initial: str = START
+    model: Model, start: Mapping[str, float] | None = None, initial: str = START
 ) -> OperatingPoint:
     """Return the equilibrium of a model, from its start values or other states.
 
     Parameters
     ----------
-    system
+    model
         The compiled model at its parameter values.
     start
         States by peer and name, such as "left[1].device.x", in SI; by default the start values.
@@ -169,16 +169,16 @@ def operating_point_from(
         E804 too many different peers; E808 a value that is not finite; E847 no equilibrium, as a constant
         force acts on a body that nothing holds; E848 no convergence; E849 an equation that depends on time.
     """
-    return _operating_point(system, None if start is None else tuple(start.items()), initial)
+    return _operating_point(model, None if start is None else tuple(start.items()), initial)
 
 
 @functools.lru_cache(maxsize=CACHE_SIZE)
 def _operating_point(
-    system: Model, start: tuple[tuple[str, float], ...] | None, initial: str
+    model: Model, start: tuple[tuple[str, float], ...] | None, initial: str
 ) -> OperatingPoint:
     """Return the equilibrium of `operating_point_from`, cached."""
-    extended = with_start_parameters(system)
-    with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
+    extended = with_start_parameters(model)
+    with single_threaded(), finite_equations(model.origin.topology), np.errstate(all="ignore"):
         numeric = _at_start(extended)
         classes = classes_of_equals(numeric)
         equations = EquilibriumEquations(numeric, classes, dict(start or ()))
@@ -192,9 +192,9 @@ def _operating_point(
             equations.peer_types, equations.split(z), equations.parameters, strict=True
         )
     ]
-    origin = system.origin if system.at_equilibrium else system.origin.after((EQUILIBRIUM_CHANGE, initial))
+    origin = model.origin if model.at_equilibrium else model.origin.after((EQUILIBRIUM_CHANGE, initial))
     return OperatingPoint(
-        topology=system.name,
+        topology=model.name,
         initial=initial,
         converged=True,
         positions=_positions(equations, z),
@@ -214,11 +214,11 @@ def _at_start(extended: Model) -> ModelNumbers:
 
 def _positions(equations: EquilibriumEquations, z: Floats) -> tuple[RestValue, ...]:
     """Return the states of all classes at rest, except velocities."""
-    system, result = equations.numeric.model, []
+    model, result = equations.numeric.model, []
     for g, (prefix, peer_type) in enumerate(zip(equations.prefixes(), equations.peer_types, strict=True)):
-        group = system.groups[equations.starting.groups[g]].name
+        group = model.groups[equations.starting.groups[g]].name
         for state, value in zip(peer_type.states, equations.split(z)[g].tolist(), strict=False):
             if state.unit not in VELOCITIES:
-                shown = parameter_of(system, ParameterRef(state.start, group)).display_unit
+                shown = parameter_of(model, ParameterRef(state.start, group)).display_unit
                 result.append(RestValue(f"{prefix}{state.name}", value, DisplayUnit(state.unit, shown)))
     return tuple(result)

@@ -26,7 +26,7 @@ MOST_CHECKED = 3
 
 
 @part("check of values")
-def check_values(system: Model) -> None:
+def check_values(model: Model) -> None:
     """Linearize and lift the first few subsystems of each peer type; raise an error for a non-finite value.
 
     A peer type whose slopes depend on received values is left to the analysis, which computes the start. Ages
@@ -39,14 +39,14 @@ def check_values(system: Model) -> None:
         E806 a frame leaves the range of floats; E808 an equation has no finite value at the start values;
         E812 a peer has too many states.
     """
-    location = SourceLocation(system.origin.topology)
-    for peer_type in system.peer_types:
+    location = SourceLocation(model.origin.topology)
+    for peer_type in model.peer_types:
         refuse_many(len(peer_type.states), location)
-    numbers = resolve(system)
-    subsystems = linear_subsystems(of_single_delay(system), numbers.timings)
-    schedules = build_schedules(system, numbers.timings, [subsystem.pattern for subsystem in subsystems])
-    with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
-        for group, schedule, rows in zip(system.groups, schedules, numbers.parameters, strict=True):
+    numbers = resolve(model)
+    subsystems = linear_subsystems(of_single_delay(model), numbers.timings)
+    schedules = build_schedules(model, numbers.timings, [subsystem.pattern for subsystem in subsystems])
+    with single_threaded(), finite_equations(model.origin.topology), np.errstate(all="ignore"):
+        for group, schedule, rows in zip(model.groups, schedules, numbers.parameters, strict=True):
             if not subsystems[group.peer_type].parameters_suffice:
                 continue
             for parameters in np.unique(rows[:MOST_CHECKED], axis=0):

@@ -52,12 +52,12 @@ def _hold_start(hold: Hold) -> str:
     return hold.start or rest_of(f"hold {hold.name}")
 
 
-def with_start_parameters(system: Model) -> Model:
+def with_start_parameters(model: Model) -> Model:
     """Return a model with a parameter of its own for each start value, 0 at first, unless it has them."""
-    if has_start_parameters(system):
-        return system
-    peer_types = tuple(map(_with_parameters, system.peer_types))
-    display = {parameter.name: parameter.display_unit for parameter in system.parameters}
+    if has_start_parameters(model):
+        return model
+    peer_types = tuple(map(_with_parameters, model.peer_types))
+    display = {parameter.name: parameter.display_unit for parameter in model.parameters}
     units: dict[str, str] = {}
     for peer_type in (*peer_types, *(item.linear for item in peer_types if item.linear is not None)):
         units |= zip(start_parameters(peer_type), start_units(peer_type), strict=True)
@@ -65,12 +65,12 @@ def with_start_parameters(system: Model) -> Model:
         Parameter(name, unit, 0.0, display_unit=display.get(start_of(name), ""))
         for name, unit in units.items()
     )
-    return replace(system, peer_types=peer_types, parameters=(*system.parameters, *added))
+    return replace(model, peer_types=peer_types, parameters=(*model.parameters, *added))
 
 
-def has_start_parameters(system: Model) -> bool:
+def has_start_parameters(model: Model) -> bool:
     """Return whether a model has parameters of its own for its start values."""
-    return all(start_parameters(item) == names_at_rest(item) for item in system.peer_types)
+    return all(start_parameters(item) == names_at_rest(item) for item in model.peer_types)
 
 
 @functools.lru_cache(maxsize=CACHE_SIZE)
@@ -96,9 +96,9 @@ def _with_parameters(peer_type: PeerType, added: tuple[str, ...] = ()) -> PeerTy
     )
 
 
-def at_topology_start(system: Model) -> Model:
+def at_topology_start(model: Model) -> Model:
     """Return a model of `with_start_parameters` that starts at the start values of the topology."""
-    return replace(system, peer_types=tuple(map(_from_start, system.peer_types)))
+    return replace(model, peer_types=tuple(map(_from_start, model.peer_types)))
 
 
 @functools.lru_cache(maxsize=CACHE_SIZE)
@@ -114,21 +114,21 @@ def _from_start(peer_type: PeerType) -> PeerType:
 
 
 def with_start_values(
-    system: Model, classes: Sequence[PeerIndices], values: Sequence[Mapping[str, float]]
+    model: Model, classes: Sequence[PeerIndices], values: Sequence[Mapping[str, float]]
 ) -> Model:
     """Return a model of `with_start_parameters` with new start values.
 
     Parameters
     ----------
-    system
+    model
         The model.
     classes, values
         Classes of peers, each within one group, and the start values of each class by the names of
         parameters. What a linear analysis leaves out keeps its start value, also by its name.
     """
     groups, first = [], 0
-    for group in system.groups:
-        names = start_parameters(system.peer_types[group.peer_type])
+    for group in model.groups:
+        names = start_parameters(model.peer_types[group.peer_type])
         rows = [
             (
                 [peer - first for peer in peers] if len(peers) < group.count else [],
@@ -141,7 +141,7 @@ def with_start_values(
         kept = tuple(value for value in group.values if value.name not in names)
         columns = tuple(column for column in group.columns if column.name not in names)
         if len(rows) == 1:
-            holder = {parameter.name: parameter for parameter in system.parameters}
+            holder = {parameter.name: parameter for parameter in model.parameters}
             kept += tuple(replace(holder[n], value=value) for n, value in zip(names, rows[0][1], strict=True))
         else:
             table: NDArray[np.float64] = np.empty((group.count, len(names)))
@@ -149,4 +149,4 @@ def with_start_values(
                 table[peers] = row
             columns += tuple(PeerColumn(n, column.copy()) for n, column in zip(names, table.T, strict=True))
         groups.append(replace(group, values=kept, columns=columns))
-    return replace(system, groups=tuple(groups))
+    return replace(model, groups=tuple(groups))

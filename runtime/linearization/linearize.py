@@ -85,9 +85,9 @@ def start_sends(
     return sent
 
 
-def start_names(system: Model) -> set[str]:
+def start_names(model: Model) -> set[str]:
     """Return the parameters that are start values of states, of clock memories and of holds."""
-    return {name for peer_type in system.peer_types for name in _start_names(peer_type)}
+    return {name for peer_type in model.peer_types for name in _start_names(peer_type)}
 
 
 def _start_names(peer_type: PeerType) -> list[str]:
@@ -97,10 +97,10 @@ def _start_names(peer_type: PeerType) -> list[str]:
     return [*(state.start for state in peer_type.states), *memory_starts, *hold_starts]
 
 
-def reaches_start(system: Model, parameter_ref: ParameterRef) -> bool:
+def reaches_start(model: Model, parameter_ref: ParameterRef) -> bool:
     """Return whether the start values depend on a parameter."""
-    starts = start_names(system)
-    return parameter_ref.name in starts or parameter_ref.name in scope_of(system).needed(sorted(starts))
+    starts = start_names(model)
+    return parameter_ref.name in starts or parameter_ref.name in scope_of(model).needed(sorted(starts))
 
 
 def sends_nothing(peer_type: PeerType, rows: NDArray[np.float64]) -> bool:

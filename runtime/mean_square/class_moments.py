@@ -98,25 +98,25 @@ def build_reception(
     stand_in
         Whether peers send, at each tick, their own value as a substitute for a missing one.
     """
-    system = numeric.model
+    model = numeric.model
     timings = dict(numeric.timings)
-    for clock in system.clocks:
+    for clock in model.clocks:
         timings[clock.phase] = (timings[clock.phase] - first) % timings[clock.period]
     patterns = [subsystem.pattern for subsystem in numeric.jacobians]
-    stored = {link.name: 0 for link in system.links}
-    schedules = build_schedules(system, timings, patterns, order=numeric.order, stored=stored)
+    stored = {link.name: 0 for link in model.links}
+    schedules = build_schedules(model, timings, patterns, order=numeric.order, stored=stored)
     schedules_per_tick = {
-        (schedule, group.peer_type): with_substitutes(schedule, system.peer_types[group.peer_type])
+        (schedule, group.peer_type): with_substitutes(schedule, model.peer_types[group.peer_type])
         if stand_in
         else with_per_tick_inputs(schedule)
-        for schedule, group in zip(schedules, system.groups, strict=True)
+        for schedule, group in zip(schedules, model.groups, strict=True)
     }
     by_tick = tuple(
         schedules_per_tick[schedule, group.peer_type]
-        for schedule, group in zip(schedules, system.groups, strict=True)
+        for schedule, group in zip(schedules, model.groups, strict=True)
     )
     shifted_system = replace(
-        system, timings=tuple(replace(timing, value=timings[timing.name]) for timing in system.timings)
+        model, timings=tuple(replace(timing, value=timings[timing.name]) for timing in model.timings)
     )
     groups, exchange = lifted_classes(replace(numeric, model=shifted_system, given_schedules=by_tick))
     rows = {group.index: schedules[exchange.group_of(group.peers.first)].selected for group in groups}
@@ -277,18 +277,18 @@ class _MomentClass:
     noise_covariances: tuple[Matrix, ...]
 
 
-def class_moments(system: Model, reception: PerTickReception) -> Moments:
+def class_moments(model: Model, reception: PerTickReception) -> Moments:
     """Return the second-moment operator of a model: its mean loops and the channel noise that drives them.
 
     Parameters
     ----------
-    system
+    model
         The model, with the parameter values to analyze.
     reception
         The peers of the model.
     """
     classes = classes_of(reception)
-    return moments_of(classes, stored_of(system, classes.reception, classes.common))
+    return moments_of(classes, stored_of(model, classes.reception, classes.common))
 
 
 def moments_of(
@@ -495,7 +495,7 @@ def peer_classes(reception: PerTickReception) -> tuple[ModalSystem, Coupling]:
 
 
 def stored_of(
-    system: Model,
+    model: Model,
     reception: PerTickReception,
     common: ModalSystem,
     *,
@@ -506,7 +506,7 @@ def stored_of(
 
     Parameters
     ----------
-    system, reception
+    model, reception
         The model and its peers.
     common
         The loop of all classes.
@@ -523,15 +523,15 @@ def stored_of(
         for index, row in enumerate(rows):
             if is_used[index] and not row.gap:
                 received.setdefault((row.coupling_term.link, row.coupling_term.delay), []).append(row)
-    links = {link.name: link for link in system.links}
+    links = {link.name: link for link in model.links}
     memories = []
-    times = {clock.name: instants(reception, clock) for clock in system.clocks}
+    times = {clock.name: instants(reception, clock) for clock in model.clocks}
     for route, selected in sorted(received.items()):
         link, delay = links[route[0]], reception.timings[route[1]]
         clock = selected[0].coupling_term.clock
         sent = times[clock or link.clock]
         ticks = {(row.clock, row.tick): times[row.clock][row.tick] for row in selected}
-        law = PERFECT if perfect or link.channel is None else channel_law(system, link, route[1])
+        law = PERFECT if perfect or link.channel is None else channel_law(model, link, route[1])
         error_bound = lost.get(route, (0.0,))
         memory = memory_of(
             law,

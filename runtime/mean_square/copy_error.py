@@ -70,12 +70,12 @@ class Forced:
         return self.of(dense_loop(self.reception.groups, self.reception.exchange).subsystems)
 
 
-def forced(system: Model, reception: PerTickReception, first: Fraction = Fraction(0)) -> Forced:
+def forced(model: Model, reception: PerTickReception, first: Fraction = Fraction(0)) -> Forced:
     """Return the peers with an independent force of variance 1 N² at each hand-held device.
 
     Parameters
     ----------
-    system
+    model
         The model.
     reception
         The peers of the model.
@@ -87,11 +87,11 @@ def forced(system: Model, reception: PerTickReception, first: Fraction = Fractio
     NotSupportedError
         The hand-held devices are ambiguous.
     """
-    unit_of = {parameter.name: parameter.unit for parameter in system.parameters}
-    direct = coupled_directly(system.peer_types)
-    used_clocks = clocks_in_use(system)
+    unit_of = {parameter.name: parameter.unit for parameter in model.parameters}
+    direct = coupled_directly(model.peer_types)
+    used_clocks = clocks_in_use(model)
     fastest = min(
-        (clock for clock in system.clocks if clock.name in used_clocks),
+        (clock for clock in model.clocks if clock.name in used_clocks),
         key=lambda clock: reception.timings[clock.period],
     )
     ticks = instants(reception, fastest)

@@ -164,13 +164,13 @@ def _mean_square_growth(numeric: NumericModel, bounded: bool) -> StabilityMeasur
     NotSupportedError
         The network is not supported.
     """
-    system = numeric.model
-    lossy = unreliable(system)
-    if why := _reason_not_supported(system, lossy):
+    model = numeric.model
+    lossy = unreliable(model)
+    if why := _reason_not_supported(model, lossy):
         raise NotSupportedError(why)
-    if independent_channels(system):
+    if independent_channels(model):
         reception = build_reception(numeric, first=Fraction(0), stand_in=False)
-        return independent_growth(system, reception, class_moments, bounded=bounded)
+        return independent_growth(model, reception, class_moments, bounded=bounded)
     extension = find_extension("loss_models")
     if extension is None:
         raise NotSupportedError(str(not_installed("loss_models")))
@@ -178,16 +178,16 @@ def _mean_square_growth(numeric: NumericModel, bounded: bool) -> StabilityMeasur
     return growth
 
 
-def independent_channels(system: Model) -> bool:
+def independent_channels(model: Model) -> bool:
     """Return whether all packets are lost or delayed independently, a lost one being replaced by the last."""
-    lossy = unreliable(system)
-    return not _reason_not_supported(system, lossy) and all(
+    lossy = unreliable(model)
+    return not _reason_not_supported(model, lossy) and all(
         law.trace is None and is_memoryless(law) and not (law.mean_loss and law.zero) for _, law in lossy
     )
 
 
 def independent_growth(
-    system: Model,
+    model: Model,
     reception: PerTickReception,
     moments: Callable[[Model, PerTickReception], Moments],
     *,
@@ -198,7 +198,7 @@ def independent_growth(
 
     Parameters
     ----------
-    system, reception
+    model, reception
         The model, and its receptions by tick.
     moments
         The function that returns the second-moment operator of the peers.
@@ -210,11 +210,11 @@ def independent_growth(
 
     def errors() -> tuple[float, str]:
         """Return the copy error in m, and a note."""
-        pushed = forced(system, reception, arrival)
+        pushed = forced(model, reception, arrival)
         classes = pushed.of(peer_classes(pushed.reception)[0].subsystems)
-        return moments_error(moments(system, pushed.reception), classes), ""
+        return moments_error(moments(model, pushed.reception), classes), ""
 
-    of = moments(system, reception)
+    of = moments(model, reception)
     if of.entries * of.states**3 > MOST_WORK:
         raise NotSupportedError(
             f"{of.entries:,} covariances of losses and delays with {of.states} states take too long; "
@@ -227,11 +227,11 @@ def independent_growth(
     )
 
 
-def _reason_not_supported(system: Model, lossy: Sequence[tuple[Link, ChannelLaw]]) -> str:
+def _reason_not_supported(model: Model, lossy: Sequence[tuple[Link, ChannelLaw]]) -> str:
     """Return the reason why a network is not supported, "" if it is supported."""
-    if why := next((why for link, _ in lossy if (why := _other_coupling(system, link))), ""):
+    if why := next((why for link, _ in lossy if (why := _other_coupling(model, link))), ""):
         return why
-    for link in system.links:  # also where no packet is lost at the present values
+    for link in model.links:  # also where no packet is lost at the present values
         if link.graph.shape == "arcs" and (link.graph.arcs[:, 0] == link.graph.arcs[:, 1]).any():
             return f"packets of {link.name} that a peer sends to itself"
     if any(law.trace is not None for _, law in lossy):
@@ -252,16 +252,16 @@ def _reason_not_supported(system: Model, lossy: Sequence[tuple[Link, ChannelLaw]
             return f"jitter and losses of {law.label} together with on_loss: zero"
         if law.jitter and not is_memoryless(law):
             return f"jitter and bursts of {law.label} together"
-        if law.jitter and link.channel.reorder == "all" and _overtakes(system, link, law):
+        if law.jitter and link.channel.reorder == "all" and _overtakes(model, link, law):
             return f"reordered packets of {law.label} that are accepted (reorder: all)"
     return ""
 
 
-def _other_coupling(system: Model, link: Link) -> str:
+def _other_coupling(model: Model, link: Link) -> str:
     """Return the use of ages or earlier packets of a link in the equations, as a text; "" without any."""
     receives = [
         receive
-        for peer_type in system.peer_types
+        for peer_type in model.peer_types
         for partition in peer_type.clocks
         for receive in partition.receives
         if receive.link == link.name
@@ -273,10 +273,10 @@ def _other_coupling(system: Model, link: Link) -> str:
     return ""
 
 
-def _overtakes(system: Model, link: Link, law: ChannelLaw) -> bool:
+def _overtakes(model: Model, link: Link, law: ChannelLaw) -> bool:
     """Return whether a packet may arrive before a packet sent earlier."""
-    timings = resolve(system).timings
-    period = min(timings[clock.period] for clock in system.clocks if clock.name in link.clocks)
+    timings = resolve(model).timings
+    period = min(timings[clock.period] for clock in model.clocks if clock.name in link.clocks)
     least = max(law.delay - law.jitter * EARLIEST[law.distribution], 0.0)
     return law.longest - least >= float(period)
 
@@ -307,11 +307,11 @@ def mean_square_stability(numeric: NumericModel, *, certify: bool = False) -> Me
 
 def _mean_square_stability(numeric: NumericModel, *, certify: bool) -> MeanSquareStability:
     """Return the mean-square stability of a model without kinks."""
-    system = numeric.model
-    with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
+    model = numeric.model
+    with single_threaded(), finite_equations(model.origin.topology), np.errstate(all="ignore"):
         result = mean_square_growth(numeric)
-        lossy_links = [link for link, law in unreliable(system) if law.mean_loss]
-        has_worst_case = lossy_links and not any(_other_coupling(system, link) for link in lossy_links)
+        lossy_links = [link for link, law in unreliable(model) if law.mean_loss]
+        has_worst_case = lossy_links and not any(_other_coupling(model, link) for link in lossy_links)
         extension = find_extension("loss_models")
         worst = extension.worst_case(numeric) if extension and has_worst_case else None
         exponent, exponent_note = _lyapunov_exponent(numeric, result)
@@ -329,7 +329,7 @@ def _mean_square_stability(numeric: NumericModel, *, certify: bool) -> MeanSquar
         "" if extension else str(not_installed("loss_models")),
     )
     return MeanSquareStability(
-        topology=system.name,
+        topology=model.name,
         verdict=verdict_of(result),
         stable=result.stable if decided_network else None,
         mean_square_radius=result.radius if decided_network else None,
@@ -346,7 +346,7 @@ def _mean_square_stability(numeric: NumericModel, *, certify: bool) -> MeanSquar
         almost_sure=exponent,
         losses_in_a_row=worst,
         linearized=not linear,
-        at_equilibrium=system.at_equilibrium,
+        at_equilibrium=model.at_equilibrium,
         notes=tuple(text for text in notes if text),
     )
 

@@ -89,12 +89,12 @@ class ChannelLaw:
         return self.delay + self.jitter * LATEST[self.distribution]
 
 
-def channel_law(system: Model, link: Link, delay: str) -> ChannelLaw:
+def channel_law(model: Model, link: Link, delay: str) -> ChannelLaw:
     """Return the parameters of the channel of a link or of a pair of groups, for the model's present values.
 
     Parameters
     ----------
-    system
+    model
         The model, with the parameter values to use (see `overrides.apply`).
     link
         A link of the model that has a channel.
@@ -113,14 +113,14 @@ def channel_law(system: Model, link: Link, delay: str) -> ChannelLaw:
         if channel.loss is None
         else (channel.loss.p, channel.loss.r, channel.loss.one_minus_h, channel.loss.one_minus_k)
     )
-    for group in system.groups:
+    for group in model.groups:
         for parameter in group.values:
             if parameter.name in loss:
                 message = f"{parameter.name} belongs to a link and can't be set by group {group.name}"
-                location = SourceLocation(system.origin.topology)
+                location = SourceLocation(model.origin.topology)
                 raise ApcError(Diagnostic("E891", location, message, advice="set it without a group"))
-    value = {parameter.name: parameter.value for parameter in system.parameters}
-    seconds = {timing.name: float(timing.value) for timing in system.timings}
+    value = {parameter.name: parameter.value for parameter in model.parameters}
+    seconds = {timing.name: float(timing.value) for timing in model.timings}
     p, r, one_minus_h, one_minus_k = (value[name] for name in loss) if loss else (0.0, 1.0, 1.0, 0.0)
     jitter = 0.0 if channel.jitter is None else seconds[channel.jitter]
     of_pairs = (

@@ -120,7 +120,7 @@ class ArrivalProcess:
 
 
 def arrival_process_of(
-    system: Model,
+    model: Model,
     timings: Mapping[str, Fraction],
     exchange: CommunicationGraph,
     route: Route,
@@ -130,7 +130,7 @@ def arrival_process_of(
 
     Parameters
     ----------
-    system
+    model
         The model, with the parameter values to use (see `overrides.apply`).
     timings
         Seconds by the name of the timing.
@@ -151,7 +151,7 @@ def arrival_process_of(
     assert link.channel is not None
     grids = {
         clock.name: (timings[clock.phase] / quantum, timings[clock.period] / quantum)
-        for clock in system.clocks
+        for clock in model.clocks
     }
     sending_clock = grids[route.sent_by or link.clock]
     groups, group_pair_of = _group_pairs(exchange, route.pairs)
@@ -160,7 +160,7 @@ def arrival_process_of(
     delays = [*dict.fromkeys(pair_delays)]
     law_of = np.array([delays.index(delay) for delay in pair_delays], np.int64)[group_pair_of]
     arrival_process = ArrivalProcess(
-        laws=tuple(channel_law(system, link, delay) for delay in delays),
+        laws=tuple(channel_law(model, link, delay) for delay in delays),
         law_of=law_of,
         nominal=np.array([max(int(timings[delay] / quantum), least) for delay in delays], np.int64)[law_of],
         phase=int(sending_clock[0]),
@@ -171,11 +171,11 @@ def arrival_process_of(
         newest=link.channel.reorder == "newest",
         least=least,
     )
-    _check_arrival_process(system, route, arrival_process)
+    _check_arrival_process(model, route, arrival_process)
     return arrival_process
 
 
-def _check_arrival_process(system: Model, route: Route, arrival_process: ArrivalProcess) -> None:
+def _check_arrival_process(model: Model, route: Route, arrival_process: ArrivalProcess) -> None:
     """Raise ApcError E892 for too many packets in transit, or for times of too many quanta."""
     latest, arcs = arrival_process.latest(route), len(route.pairs)
     if max(latest, route.ticks * arrival_process.tick_period) > LONGEST:
@@ -188,7 +188,7 @@ def _check_arrival_process(system: Model, route: Route, arrival_process: Arrival
         raise ApcError(
             Diagnostic(
                 "E892",
-                SourceLocation(system.origin.topology),
+                SourceLocation(model.origin.topology),
                 message,
                 advice="use periods and delays in whole µs",
             )
@@ -199,7 +199,7 @@ def _check_arrival_process(system: Model, route: Route, arrival_process: Arrival
     )
     advice = "shorten the delay or jitter, reduce the number of peers, or use graph: ring"
     refuse_beyond(
-        ARC_BYTES * arcs + PACKET * packets, "E892", SourceLocation(system.origin.topology), message, advice
+        ARC_BYTES * arcs + PACKET * packets, "E892", SourceLocation(model.origin.topology), message, advice
     )
 
 
@@ -393,13 +393,13 @@ def _link_receivers(
 
 
 def routes_of(
-    system: Model, timings: Mapping[str, Fraction], exchange: CommunicationGraph, frame_s: Fraction
+    model: Model, timings: Mapping[str, Fraction], exchange: CommunicationGraph, frame_s: Fraction
 ) -> tuple[Route, ...]:
     """Return the routes: one per unreliable link, per clock that receives from it, and per clock that sends.
 
     Parameters
     ----------
-    system, timings, exchange
+    model, timings, exchange
         As for `arrival_process_of`.
     frame_s
         The length of a frame in seconds.
@@ -409,13 +409,13 @@ def routes_of(
     ApcError
         E891 a group sets its own value for a link parameter; E892 too many directed peer pairs.
     """
-    unreliable = [link for link in system.links if link.channel is not None]
-    result = [_routes_over(system, timings, exchange, frame_s, link) for link in unreliable]
+    unreliable = [link for link in model.links if link.channel is not None]
+    result = [_routes_over(model, timings, exchange, frame_s, link) for link in unreliable]
     return tuple(route for routes in result for route in routes)
 
 
 def _routes_over(
-    system: Model,
+    model: Model,
     timings: Mapping[str, Fraction],
     exchange: CommunicationGraph,
     frame_s: Fraction,
@@ -428,17 +428,17 @@ def _routes_over(
             f"{link.name} is unreliable; {peers} completely connected peers have "
             f"{peers * (peers - 1)} directed connections; the limit is {MOST_ARCS}"
         )
-        raise ApcError(Diagnostic("E892", SourceLocation(system.origin.topology), message, fix="graph: ring"))
-    peer_type_of = np.repeat([group.peer_type for group in system.groups], np.diff(exchange.starts))
+        raise ApcError(Diagnostic("E892", SourceLocation(model.origin.topology), message, fix="graph: ring"))
+    peer_type_of = np.repeat([group.peer_type for group in model.groups], np.diff(exchange.starts))
     pairs, weights = exchange.arcs(link.name)
     order = np.lexsort((pairs[:, 0], pairs[:, 1]))  # receiver by receiver
     pairs, weights = pairs[order], weights[order]
     sends = np.array(
-        [any(send.link == link.name for send in peer_type.sends) for peer_type in system.peer_types]
+        [any(send.link == link.name for send in peer_type.sends) for peer_type in model.peer_types]
     )
     used: dict[tuple[str, str], tuple[Integers, Floats]] = {}
-    for clock in system.clocks:
-        receives = np.array([_receives(peer_type, link.name, clock.name) for peer_type in system.peer_types])
+    for clock in model.clocks:
+        receives = np.array([_receives(peer_type, link.name, clock.name) for peer_type in model.peer_types])
         arcs = sends[peer_type_of[pairs[:, 0]]] & receives[peer_type_of[pairs[:, 1]]]
         sent_by = _own_clocks(exchange, link, pairs)
         for name in sorted({*sent_by[arcs].tolist()}):
@@ -446,8 +446,8 @@ def _routes_over(
             used[clock.name, name] = pairs[of_clock], weights[of_clock]
     groups = {pair for clock_pairs, _ in used.values() for pair in _group_pairs(exchange, clock_pairs)[0]}
     delays = {exchange.delay(link.name, *pair) for pair in groups}
-    longest = max((channel_law(system, link, delay).longest for delay in delays), default=0.0)
-    periods = {clock.name: timings[clock.period] for clock in system.clocks}
+    longest = max((channel_law(model, link, delay).longest for delay in delays), default=0.0)
+    periods = {clock.name: timings[clock.period] for clock in model.clocks}
     return [
         Route(
             link=link.name,

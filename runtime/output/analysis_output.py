@@ -96,31 +96,31 @@ MARKS = "os^Dv"
 LETTERS = 75  # of a line of a title
 
 
-def compile_text(system: Model, model_size: ModelSize, target: Path) -> Lines:
+def compile_text(model: Model, model_size: ModelSize, target: Path) -> Lines:
     """Yield the output of `apc compile`.
 
     Parameters
     ----------
-    system, model_size
+    model, model_size
         The model and what it keeps.
     target
         The file written.
     """
     ticks = " = ".join(f"{counted(count, f'{name} period')}" for name, count in model_size.ticks)
-    yield f"{system.name} → {target}"
+    yield f"{model.name} → {target}"
     yield from notes(str(replace(model_size, pairs=())))  # they follow, with their reason
     frame = f"frame {quantity(float(model_size.frame), 's')}"
     yield from notes(f"{frame} = {ticks}" if ticks else f"{frame} (no clock is used)")
-    yield from warning_lines(system.warnings)
-    dropped = (f"omitted: {name}, as {reason}" for name, reason in system.dropped)
-    yield from notes(*_pairwise(system), *dropped)
+    yield from warning_lines(model.warnings)
+    dropped = (f"omitted: {name}, as {reason}" for name, reason in model.dropped)
+    yield from notes(*_pairwise(model), *dropped)
 
 
-def _pairwise(system: Model) -> Iterator[str]:
+def _pairwise(model: Model) -> Iterator[str]:
     """Yield the pairwise evaluations, and the reasons why they are not per peer."""
     result = {
         receive.name: receive
-        for peer_type in system.peer_types
+        for peer_type in model.peer_types
         for clock in peer_type.clocks
         for receive in clock.receives
         if receive.edge is not None or receive.operator in ("max", "min")

@@ -46,12 +46,12 @@ def check_animation(path: Path) -> None:
 
 
 @part("draw")
-def save_animation(system: Model, trajectory: Trajectory, path: Path) -> None:
+def save_animation(model: Model, trajectory: Trajectory, path: Path) -> None:
     """Draw a run into a file that moves, its format chosen by the suffix.
 
     Parameters
     ----------
-    system
+    model
         The model.
     trajectory
         Its run, with the positions of all bodies among the signals.
@@ -65,7 +65,7 @@ def save_animation(system: Model, trajectory: Trajectory, path: Path) -> None:
     """
     check_animation(path)
     moving = need("matplotlib.animation", "plot")
-    figure, actors, lines = draw_actors(system)
+    figure, actors, lines = draw_actors(model)
     columns = {signal.name: index for index, signal in enumerate(trajectory.signals)}
     tracks = [MM * trajectory.values[:, [columns[name] for name in actor.states]] for actor in actors]
     turns = [heading(trajectory.values[:, [columns[text] for text in actor.turning]]) for actor in actors]
@@ -92,7 +92,7 @@ def save_animation(system: Model, trajectory: Trajectory, path: Path) -> None:
             named = Path(folder, f"moving{path.suffix.lower()}")  # writers go by the suffix
             with writer.saving(figure, named, DPI):
                 for row in rows.tolist():
-                    title.set_text(f"{system.name}: {trajectory.time[row]:.3f} s{pace}")
+                    title.set_text(f"{model.name}: {trajectory.time[row]:.3f} s{pace}")
                     for actor, track, turn in zip(actors, tracks, turns, strict=True):
                         actor.move(track[row], turn[row])
                     for line in lines:

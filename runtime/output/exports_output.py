@@ -130,7 +130,7 @@ def code_document(code: Code) -> Plain:
 def unit_text(unit: FmuContent) -> Lines:
     """Yield the inputs and outputs of an FMU."""
     subject = unit.peer or counted(len(unit.topology.peers), "peer")
-    yield f"{unit.system.name}: {subject} for co-simulation, FMI 2.0\n"
+    yield f"{unit.model.name}: {subject} for co-simulation, FMI 2.0\n"
     variables = unit.topology.variables
     fixed = [variable.name for variable in variables if variable.role == "parameter"]
     yield from _numbered("input", [variable.name for variable in variables if variable.given])
@@ -156,7 +156,7 @@ def unit_document(unit: FmuContent) -> Plain:
         for variable in unit.topology.variables
     ]
     return {
-        "topology": unit.system.name,
+        "topology": unit.model.name,
         "peer": unit.peer or None,
         "step_s": unit.step,
         "duration_s": document(unit.duration),

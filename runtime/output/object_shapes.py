@@ -126,29 +126,29 @@ def rotations_of(peer_type: PeerType) -> dict[str, list[int]]:
     return {part: locations for part, locations in result.items() if len(locations) in (1, 3)}
 
 
-def moves_in_plane(system: Model) -> bool:
+def moves_in_plane(model: Model) -> bool:
     """Return whether some body's position is a vector."""
     return any(
-        len(indices) > 1 for peer_type in system.peer_types for indices in positions_of(peer_type).values()
+        len(indices) > 1 for peer_type in model.peer_types for indices in positions_of(peer_type).values()
     )
 
 
-def views_of(system: Model) -> list[PeerView]:
+def views_of(model: Model) -> list[PeerView]:
     """Return the first `MOST_PEERS` peers as they look at the start."""
-    numbers = resolve(system)
-    subsystems = [jacobians(peer_type) for peer_type in system.peer_types]
-    plane = moves_in_plane(system)
+    numbers = resolve(model)
+    subsystems = [jacobians(peer_type) for peer_type in model.peer_types]
+    plane = moves_in_plane(model)
     peer_views: list[PeerView] = []
-    for group, members in enumerate(system.groups):
+    for group, members in enumerate(model.groups):
         for peer in range(min(members.count, MOST_PEERS - len(peer_views))):
             vector = [float(value) for value in numbers.parameters[group][numbers.rows[group][peer]]]
             start, _, _ = start_values(subsystems[members.peer_type], vector)
-            bodies, surfaces = bodies_of(system.peer_types[members.peer_type], vector, start)
+            bodies, surfaces = bodies_of(model.peer_types[members.peer_type], vector, start)
             shown = tuple(body for body in bodies if not plane or len(body.position) > 1)
             names = {body.name for body in shown}
             contacts = tuple(
                 contact
-                for contact in contacts_of(system.peer_types[members.peer_type], vector, start)
+                for contact in contacts_of(model.peer_types[members.peer_type], vector, start)
                 if {contact.holder, contact.held} <= names
             )
             peer_views.append(PeerView(f"{members.name}[{peer + 1}]", shown, tuple(surfaces), contacts))

@@ -63,11 +63,11 @@ def _topology(path: Path) -> dict[str, Any]:
     """Return the page's text for a model."""
     from apc.compiler.pipeline import compile_topology  # it imports algebra, which a report does not need
 
-    system = compile_topology(path)
+    model = compile_topology(path)
     return {
         "name": path.stem,
-        "description": system.description,
+        "description": model.description,
         "figure": graph_picture(diagram_of(path)),
-        "verdict": str(answer(system, margins=False)).partition("\n\n")[0],
+        "verdict": str(answer(model, margins=False)).partition("\n\n")[0],
         "text": _COMMENTS.sub("", path.read_text(encoding="utf-8")),
     }

@@ -199,7 +199,7 @@ def critical_picture(critical: Critical, ax: Any) -> Any:
     from apc.output.analysis_output import locus_picture
     from apc.studies.root_locus import root_locus
 
-    return locus_picture(root_locus(critical.system, critical), ax)
+    return locus_picture(root_locus(critical.model, critical), ax)
 
 
 def critical_document(critical: Critical) -> Plain:

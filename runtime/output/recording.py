@@ -237,7 +237,7 @@ def open_recording(path: Path, simulation: Simulation) -> Recording:
         each += IN_PARQUET[0] + IN_PARQUET[1] * -(-simulation.rows // block)
     needed, contents = columns * each, f"{simulation.rows:,} rows of {columns:,} columns in {path.name}"
     refuse_beyond(
-        needed, "E876", SourceLocation(simulation.system.origin.topology), contents, "record fewer --signals"
+        needed, "E876", SourceLocation(simulation.model.origin.topology), contents, "record fewer --signals"
     )
     return Recording(path, simulation)
 

@@ -143,7 +143,7 @@ def region_document(region: Region) -> Plain:
         "boundary": [{**picked(curve, *each), "stable_side": "left"} for curve in region.curves],
         "area_unit": _product(region.x.unit, region.y.unit),
         "finest_cell": region.finest,
-        "origin": dict(region.system.origin.digests),
+        "origin": dict(region.model.origin.digests),
     }
 
 
@@ -190,7 +190,7 @@ def panels_rows(panels: Panels) -> Tabled:
     made = {
         "axes": [range_document(interval) for interval in (regions[0][0].x, regions[0][0].y)],
         "limitations": {region.topology: list(region.limitations) for region, _ in regions},
-        "origin": {region.topology: dict(region.system.origin.digests) for region, _ in regions},
+        "origin": {region.topology: dict(region.model.origin.digests) for region, _ in regions},
     }
     rows = (row for region, title in regions for row in _rows(region, title))
     return _columns(regions[0][0]), rows, made

@@ -204,7 +204,7 @@ def _draw_panel(ax: Any, title: str, panel: Panel) -> None:
 
 def _axis_unit(region: Region, interval: Range, largest: float) -> tuple[float, str]:
     """Return the factor from SI to the unit of an axis, and that unit; probabilities are in percent."""
-    channels = [channel for link in region.system.links for channel in link.channels]
+    channels = [channel for link in region.model.links for channel in link.channels]
     losses = [channel.loss.p for channel in channels if channel.loss]
     return (100.0, "%") if interval.free.name in losses else prefixed(largest, interval.unit)
 

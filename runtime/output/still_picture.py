@@ -88,7 +88,7 @@ def _bar(angle: float) -> tuple[int, int, float]:
     return 2, 2, math.degrees(angle) - 90
 
 
-def draw_actors(system: Model) -> tuple[Any, list[Actor], list[ContactLine]]:
+def draw_actors(model: Model) -> tuple[Any, list[Actor], list[ContactLine]]:
     """Draw the initial state of a model; return the matplotlib Figure, its bodies and lines, to be moved.
 
     Raises
@@ -96,7 +96,7 @@ def draw_actors(system: Model) -> tuple[Any, list[Actor], list[ContactLine]]:
     ApcError
         E875 matplotlib is not installed.
     """
-    views, plane = views_of(system), moves_in_plane(system)
+    views, plane = views_of(model), moves_in_plane(model)
     axes = _planes(views) if plane else _rows(views)
     names = list(dict.fromkeys(body.name for view in views for body in view.bodies))
     colours = dict(zip(names, colours_of(len(names)), strict=True))
@@ -122,11 +122,11 @@ def draw_actors(system: Model) -> tuple[Any, list[Actor], list[ContactLine]]:
     handles = {actor.artists[0].get_label(): actor.artists[0] for actor in actors}
     style = {"loc": "outside lower center", "ncols": 4, "frameon": False, "fontsize": 8}
     figure.legend(*short_legend([*handles.values()], [*handles]), **style)
-    left = system.peers - len(views)
-    title = f"{system.name}: initial state" + (f" ({left} more peers not drawn)" if left else "")
+    left = model.peers - len(views)
+    title = f"{model.name}: initial state" + (f" ({left} more peers not drawn)" if left else "")
     if any(len(body.position) == 3 for view in views for body in view.bodies):
         title += "\nprojection onto the first two coordinates"
-    if plane and (alone := _on_an_axis(system)):
+    if plane and (alone := _on_an_axis(model)):
         title += f"\nnot drawn (motion along one axis): {', '.join(alone)}"
     figure.suptitle(title, fontsize=11)
     return figure, actors, lines
@@ -240,7 +240,7 @@ def widen(actor: Actor, track: NDArray[np.float64]) -> None:
         actor.ax.update_datalim([corner if len(corner) > 1 else (*corner, actor.row)])
 
 
-def _on_an_axis(system: Model) -> list[str]:
+def _on_an_axis(model: Model) -> list[str]:
     """Return the bodies whose position is a number."""
-    positions = [pair for peer_type in system.peer_types for pair in positions_of(peer_type).items()]
+    positions = [pair for peer_type in model.peer_types for pair in positions_of(peer_type).items()]
     return list(dict.fromkeys(name.rpartition(".")[0] for name, indices in positions if len(indices) == 1))

@@ -211,11 +211,11 @@ def _active_lines(tuning: Tuning, binding: ActiveConstraint) -> Lines:
         yield from wrapped(text, "    ", "      ")
 
 
-def panels_of(system: Model, gains: int) -> tuple[bool, bool]:
+def panels_of(model: Model, gains: int) -> tuple[bool, bool]:
     """Refuse a picture of gains without a stable region or impulse response: ApcError E996."""
     two, moves = (
         gains == 2,
-        any(state.unit == "m/s" for peer_type in system.peer_types for state in peer_type.states),
+        any(state.unit == "m/s" for peer_type in model.peer_types for state in peer_type.states),
     )
     if not (two or moves):
         message = "a picture without motion requires two parameters of --free"
@@ -240,10 +240,10 @@ def tuning_picture(tuning: Tuning, ax: Any = None) -> Any:
 
 def _scenario_models(tuning: Tuning) -> dict[str, Model]:
     """Return the models by scenario: of the active constraints, then at the ends of all ranges in `over`."""
-    system = tuning.topologies[0]
+    model = tuning.topologies[0]
     named = [_where(active) for active in tuning.active] or [tuning.topology]
     result = dict(zip(named, tuning.topologies, strict=True))
-    counts = {group_count(group.name) for group in system.groups}
+    counts = {group_count(group.name) for group in model.groups}
     values = [
         [Fraction(count) for count in range(int(interval.low), int(interval.high) + 1)]
         if interval.free.name in counts
@@ -258,7 +258,7 @@ def _scenario_models(tuning: Tuning) -> dict[str, Model]:
         overrides = [
             Override(interval.free, value) for interval, value in zip(tuning.over, corner, strict=True)
         ]
-        result.setdefault(", ".join(texts), apply(system, overrides))
+        result.setdefault(", ".join(texts), apply(model, overrides))
     return result
 
 

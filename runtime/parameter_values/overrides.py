@@ -38,7 +38,7 @@ class Override:
     value: Fraction
 
 
-def parse_override(system: Model, text: str) -> Override:
+def parse_override(model: Model, text: str) -> Override:
     """Read `NAME=QUANTITY`; the name may start with a group, or with its section of the topology.
 
     Raises
@@ -55,9 +55,9 @@ def parse_override(system: Model, text: str) -> Override:
     if not (equals and name and value):
         form = "contact.stiffness=800 N/m"
         raise ApcError(Diagnostic("E621", OVERRIDE, "override", "NAME=VALUE", text[:80], form))
-    parameter_ref = find(system, name, OVERRIDE, counts=True, value=value)
-    unit = unit_of(system, parameter_ref.name)
-    choices = choices_of(system, parameter_ref)
+    parameter_ref = find(model, name, OVERRIDE, counts=True, value=value)
+    unit = unit_of(model, parameter_ref.name)
+    choices = choices_of(model, parameter_ref)
     if value in choices:
         return Override(parameter_ref, Fraction(choices[value]))
     try:
@@ -70,7 +70,7 @@ def parse_override(system: Model, text: str) -> Override:
     return Override(parameter_ref, result.value)
 
 
-def apply(system: Model, overrides: Sequence[Override]) -> Model:
+def apply(model: Model, overrides: Sequence[Override]) -> Model:
     """Return the model with new values.
 
     A parameter that is set loses its formula, and its dependents are computed.
@@ -82,18 +82,18 @@ def apply(system: Model, overrides: Sequence[Override]) -> Model:
         beyond the parameter's bounds, E625 an invalid time, E626 an invalid number of peers.
     """
     if not overrides:
-        return system
+        return model
     common_values = with_times_of_groups(
-        system, {override.free.name: override.value for override in overrides if override.free.group is None}
+        model, {override.free.name: override.value for override in overrides if override.free.group is None}
     )
-    counts = _changed_counts(system, common_values)
+    counts = _changed_counts(model, common_values)
     if counts:
         common_values |= peers_of(counts)
-    timings = {timing.name for timing in system.timings}
-    parameters = {parameter.name: parameter for parameter in system.parameters}
-    common = _with_dependents(scope_of(system), common_values)
+    timings = {timing.name for timing in model.timings}
+    parameters = {parameter.name: parameter for parameter in model.parameters}
+    common = _with_dependents(scope_of(model), common_values)
     groups = []
-    for group in system.groups:
+    for group in model.groups:
         own_values = {
             override.free.name: override.value for override in overrides if override.free.group == group.name
         }
@@ -104,9 +104,9 @@ def apply(system: Model, overrides: Sequence[Override]) -> Model:
         values = {value.name: value for value in group.values if value.name not in shared}
         values |= {name: parameters[name] for name in own_values if name not in values}
         if own_values:
-            _check_times(system, group.name, list(values.values()), own_values)
+            _check_times(model, group.name, list(values.values()), own_values)
         given = {**shared, **own_values}
-        changed = _with_dependents(scope_of(system, list(values.values())), given)
+        changed = _with_dependents(scope_of(model, list(values.values())), given)
         if own_values:
             # A value shared by all groups becomes the group's own once it depends on a value of its own.
             values |= {
@@ -129,15 +129,15 @@ def apply(system: Model, overrides: Sequence[Override]) -> Model:
             )
         )
     compiled_system = replace(
-        system,
-        origin=system.origin.after(*((override.free.label, str(override.value)) for override in overrides)),
+        model,
+        origin=model.origin.after(*((override.free.label, str(override.value)) for override in overrides)),
         parameters=tuple(
-            _with_changed_value(parameter, common, common_values) for parameter in system.parameters
+            _with_changed_value(parameter, common, common_values) for parameter in model.parameters
         ),
-        timings=tuple(_with_changed_value(timing, common, common_values) for timing in system.timings),
+        timings=tuple(_with_changed_value(timing, common, common_values) for timing in model.timings),
         groups=tuple(groups),
-        within=tuple(axis for axis in system.within if axis.parameter not in common_values),
-        experiment=_changed_experiment(system, common),
+        within=tuple(axis for axis in model.within if axis.parameter not in common_values),
+        experiment=_changed_experiment(model, common),
     )
     if counts:
         compiled_system = recounted(compiled_system, counts, OVERRIDE)
@@ -145,14 +145,14 @@ def apply(system: Model, overrides: Sequence[Override]) -> Model:
     return compiled_system
 
 
-def _changed_counts(system: Model, common_values: Mapping[str, Fraction]) -> dict[str, Fraction]:
+def _changed_counts(model: Model, common_values: Mapping[str, Fraction]) -> dict[str, Fraction]:
     """Return the number of peers of each group after an override; empty if no number changes.
 
     `common_values` are the overridden values that hold for all groups, by parameter name.
     """
-    counts = {group.name: Fraction(group.count) for group in system.groups}
+    counts = {group.name: Fraction(group.count) for group in model.groups}
     count_names = {group_count(name) for name in counts}
-    scope = scope_of(system)
+    scope = scope_of(model)
     if scope.needed(count_names).isdisjoint(common_values):
         return {}
     values = scope.follow(common_values, exact_value, lambda name: scope.holder[name].number, count_names)
@@ -175,9 +175,9 @@ def _with_changed_value(item: N, changed: Mapping[str, Fraction], given: Collect
     return replace(item, value=float(value), exact=value, formula=formula)
 
 
-def _changed_experiment(system: Model, changed: Mapping[str, Fraction]) -> Experiment:
+def _changed_experiment(model: Model, changed: Mapping[str, Fraction]) -> Experiment:
     """Return the experiment with the times that depend on changed values."""
-    experiment, holder = system.experiment, scope_of(system).holder
+    experiment, holder = model.experiment, scope_of(model).holder
 
     def time(formula: Formula | None, present: T) -> T | Fraction:
         """Return a time in seconds by its formula, the present one if nothing changes it."""
@@ -195,22 +195,22 @@ def _changed_experiment(system: Model, changed: Mapping[str, Fraction]) -> Exper
 
 
 def _check_times(
-    system: Model, group: str, values: Sequence[Parameter], own_values: Mapping[str, Fraction]
+    model: Model, group: str, values: Sequence[Parameter], own_values: Mapping[str, Fraction]
 ) -> None:
     """Raise ApcError E622 for a group's own value on which a time for all groups depends.
 
     Parameters
     ----------
-    system
+    model
         The model before any override.
     group, values, own_values
         The group, its own parameters, and the values set for it.
     """
-    changed = _with_dependents(scope_of(system, [*values, *system.timings]), own_values)
-    shared = {timing.name: "a time common to all groups" for timing in system.timings}
-    shared |= {group_count(group.name): "a number of the topology" for group in system.groups}
+    changed = _with_dependents(scope_of(model, [*values, *model.timings]), own_values)
+    shared = {timing.name: "a time common to all groups" for timing in model.timings}
+    shared |= {group_count(group.name): "a number of the topology" for group in model.groups}
     shared |= {
-        name: "a number of the topology" for formula in system.experiment.formulas for name in formula.names
+        name: "a number of the topology" for formula in model.experiment.formulas for name in formula.names
     }
     for name, meant in shared.items():
         if name in changed:
@@ -219,25 +219,25 @@ def _check_times(
             raise ApcError(Diagnostic("E622", OVERRIDE, message, advice=advice))
 
 
-def _check_bounds(system: Model) -> None:
+def _check_bounds(model: Model) -> None:
     """Raise an error with every value that is out of its bounds.
 
     Values that follow from others are checked once all other values are within their bounds.
     """
     mistakes = Mistakes()
     for follows in (False, True):
-        for parameter in system.parameters:
+        for parameter in model.parameters:
             if (parameter.formula is not None) == follows:
                 check_bounds(parameter, parameter.name, mistakes)
-        for group in system.groups:
+        for group in model.groups:
             for parameter in group.values:
                 if (parameter.formula is not None) == follows:
                     check_bounds(parameter, f"{group.name}.{parameter.name}", mistakes)
         mistakes.raise_if_any()
-    for group in system.groups:
-        _check_columns(system, group, mistakes)
-    periods = {clock.period for clock in system.clocks}
-    for timing in system.timings:
+    for group in model.groups:
+        _check_columns(model, group, mistakes)
+    periods = {clock.period for clock in model.clocks}
+    for timing in model.timings:
         got = _in_ms(timing.value)
         if timing.name in periods and timing.value <= 0:
             expected = "a time above 0 s"
@@ -245,12 +245,12 @@ def _check_bounds(system: Model) -> None:
         elif timing.value < 0:
             expected = "a time of 0 s or more"
             mistakes.add("E625", OVERRIDE, timing.name, expected=expected, got=got, subject=timing.name)
-    duration = system.experiment.duration
+    duration = model.experiment.duration
     if duration is not None and duration <= 0:
         expected, got = "a time above 0 s", _in_ms(duration)
         mistakes.add("E625", OVERRIDE, "duration", expected=expected, got=got, subject="duration")
-    seconds = {timing.name: timing.value for timing in system.timings}
-    for clock in system.clocks:
+    seconds = {timing.name: timing.value for timing in model.timings}
+    for clock in model.clocks:
         if not seconds[clock.phase] < seconds[clock.period] and seconds[clock.period] > 0:
             got = _in_ms(seconds[clock.phase])
             mistakes.add("E625", OVERRIDE, clock.phase, expected="less than the clock's period", got=got)
@@ -309,10 +309,10 @@ def _in_ms(seconds: Fraction) -> str:
     return f"{1000 * float(seconds):.9g} ms"
 
 
-def _check_columns(system: Model, group: Group, mistakes: Mistakes) -> None:
+def _check_columns(model: Model, group: Group, mistakes: Mistakes) -> None:
     """Record, for each parameter that differs between peers, the first peer's value out of its bounds."""
-    columns = columns_of(system, group)
-    holder = {parameter.name: parameter for parameter in (*system.parameters, *group.values)}
+    columns = columns_of(model, group)
+    holder = {parameter.name: parameter for parameter in (*model.parameters, *group.values)}
     for name, parameter in holder.items():
         if name not in columns:
             continue

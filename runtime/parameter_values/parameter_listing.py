@@ -66,39 +66,37 @@ class Parameters(Result):
     shown_by: ClassVar[str] = "parameter_studies_output:parameters"
 
 
-def parameters(system: Model) -> Parameters:
+def parameters(model: Model) -> Parameters:
     """Return the settable numbers of a model, with value, unit and limits."""
-    return Parameters(system.name, tuple(_rows(system)))
+    return Parameters(model.name, tuple(_rows(model)))
 
 
-def _rows(system: Model) -> Iterator[Settable]:
+def _rows(model: Model) -> Iterator[Settable]:
     """Yield a row for each settable number; for each group where their values differ."""
-    times = {timing.name for timing in system.timings}
-    for parameter in system.parameters:
+    times = {timing.name for timing in model.timings}
+    for parameter in model.parameters:
         if not is_named(parameter.name) or parameter.name in times:
             continue
-        if not values_by_group(system, ParameterRef(parameter.name)):
+        if not values_by_group(model, ParameterRef(parameter.name)):
             yield _parameter_row(parameter, parameter.name, parameter.value, parameter.value)
             continue
-        for group in system.groups:
-            group_parameter = parameter_of(system, ParameterRef(parameter.name, group.name))
+        for group in model.groups:
+            group_parameter = parameter_of(model, ParameterRef(parameter.name, group.name))
             yield _parameter_row(
-                group_parameter, f"{group.name}.{parameter.name}", *_span(system, group, group_parameter)
+                group_parameter, f"{group.name}.{parameter.name}", *_span(model, group, group_parameter)
             )
-    for timing in named_times(system):
-        yield _time(system, timing)
-    for group in system.groups:
-        yield _count(system, group)
+    for timing in named_times(model):
+        yield _time(model, timing)
+    for group in model.groups:
+        yield _count(model, group)
 
 
-def _count(system: Model, group: Group) -> Settable:
+def _count(model: Model, group: Group) -> Settable:
     """Return the row of a group's number of peers: settable if its peers are equal and no graph
     names them.
     """
-    parameter = next(
-        parameter for parameter in system.parameters if parameter.name == group_count(group.name)
-    )
-    named = [link.name for link in system.links if link.graph.shape == "arcs" and not link.graph.groups]
+    parameter = next(parameter for parameter in model.parameters if parameter.name == group_count(group.name))
+    named = [link.name for link in model.links if link.graph.shape == "arcs" and not link.graph.groups]
     local = [column.name for column in group.columns if not counts_peers(column.name)]
     fixed = f"the graph of {named[0]} lists the peers by name" if named else ""
     fixed = f"{local[0]} has a value for each peer" if local else fixed
@@ -117,9 +115,9 @@ def _count(system: Model, group: Group) -> Settable:
     )
 
 
-def _span(system: Model, group: Group, parameter: Parameter) -> tuple[float, float]:
+def _span(model: Model, group: Group, parameter: Parameter) -> tuple[float, float]:
     """Return the least and the largest value of a parameter within a group, in SI."""
-    values = columns_of(system, group).get(parameter.name)
+    values = columns_of(model, group).get(parameter.name)
     return (parameter.value, parameter.value) if values is None else (float(min(values)), float(max(values)))
 
 
@@ -140,23 +138,23 @@ def _parameter_row(parameter: Parameter, name: str, low: float, high: float) -> 
     )
 
 
-def _time(system: Model, timing: Timing) -> Settable:
+def _time(model: Model, timing: Timing) -> Settable:
     """Return the row of a timing: a period above 0 s, a phase below its period, or a delay."""
-    values = [item.value for item in system.timings if item.name in times_of(system, timing.name)]
+    values = [item.value for item in model.timings if item.name in times_of(model, timing.name)]
     description = ""
-    for clock in system.clocks:
+    for clock in model.clocks:
         if timing.name == clock.period:
             description = f"period of clock {clock.name}"
         if timing.name == clock.phase:
             description = f"first tick of clock {clock.name}, below its period"
-    if any(timing.name in link.delays for link in system.links):
+    if any(timing.name in link.delays for link in model.links):
         description = "from sending a packet to its availability at the receiver"
     text = next(
-        (parameter.description for parameter in system.parameters if parameter.name == timing.name),
+        (parameter.description for parameter in model.parameters if parameter.name == timing.name),
         description,
     )
     low, high = float(min(values)), float(max(values))
-    is_period = timing.name in {clock.period for clock in system.clocks}
+    is_period = timing.name in {clock.period for clock in model.clocks}
     return Settable(timing.name, low, high, "s", 0.0, is_period, None, _text(timing), "", text)
 
 

@@ -76,36 +76,36 @@ class ParameterScope:
 
 
 def scope_of(
-    system: Model, group_values: Sequence[Parameter | Timing] = (), *, fixed: Collection[str] = ()
+    model: Model, group_values: Sequence[Parameter | Timing] = (), *, fixed: Collection[str] = ()
 ) -> ParameterScope:
     """Return the parameters and timings of a group of peers, or those common to all peers.
 
     Parameters
     ----------
-    system
+    model
         The compiled model.
     group_values
         The group's own values; a later value replaces an earlier one of the same name.
     fixed
         Names whose formulas are not used.
     """
-    numbers: list[Parameter | Timing] = [*system.timings, *system.parameters, *group_values]
+    numbers: list[Parameter | Timing] = [*model.timings, *model.parameters, *group_values]
     holder = {number.name: number for number in numbers}
     formulas = {
         name: formula
-        for name in system.followers
+        for name in model.followers
         if name in holder and name not in fixed and (formula := holder[name].formula) is not None
     }
     return ParameterScope(holder, formulas)
 
 
-def with_times_of_groups(system: Model, given: Mapping[str, V]) -> dict[str, V]:
+def with_times_of_groups(model: Model, given: Mapping[str, V]) -> dict[str, V]:
     """Return values by name, extended by the timings of groups that follow from them.
 
     A value for all groups replaces the timings of single groups, except those that are in `given` too.
     """
     group_timings = {
-        time: value for name, value in given.items() for time in times_of(system, name) if time != name
+        time: value for name, value in given.items() for time in times_of(model, name) if time != name
     }
     return group_timings | dict(given)
 
@@ -117,13 +117,13 @@ def _formula_values(name: str, formula: Formula, values: list[Any]) -> Any:
 
 
 def columns_of(
-    system: Model, group: Group, requested: Collection[str] | None = None, peer: int | None = None
+    model: Model, group: Group, requested: Collection[str] | None = None, peer: int | None = None
 ) -> dict[str, Floats]:
     """Return the parameters of a group that differ from peer to peer, given or by a formula, (count,) each.
 
     Parameters
     ----------
-    system, group
+    model, group
         The group of peers.
     requested
         The names of parameters to compute; None for all.
@@ -139,7 +139,7 @@ def columns_of(
         return {}
     selection = slice(None) if peer is None else slice(peer, peer + 1)
     given = {column.name: column.values[selection] for column in group.columns}
-    scope = scope_of(system, group.values, fixed=given)
+    scope = scope_of(model, group.values, fixed=given)
 
     def compute(name: str, formula: Formula, values: list[Any]) -> Floats:
         """Return a parameter's value for each peer by its formula.
@@ -174,22 +174,22 @@ class ResolvedNumbers:
     timings: Mapping[str, Fraction]
 
 
-def resolve(system: Model) -> ResolvedNumbers:
+def resolve(model: Model) -> ResolvedNumbers:
     """Return the numerical values of a model. Raises ApcError as `columns_of`."""
-    pairs = [_distinct_rows(system, group) for group in system.groups]
+    pairs = [_distinct_rows(model, group) for group in model.groups]
     return ResolvedNumbers(
         parameters=tuple(parameters for parameters, _ in pairs),
         rows=tuple(rows for _, rows in pairs),
-        timings={timing.name: timing.value for timing in system.timings},
+        timings={timing.name: timing.value for timing in model.timings},
     )
 
 
-def _distinct_rows(system: Model, group: Group) -> tuple[Floats, NDArray[np.int64]]:
+def _distinct_rows(model: Model, group: Group) -> tuple[Floats, NDArray[np.int64]]:
     """Return a group's distinct parameter rows (k, n_p), and the index (count,) of each peer's row."""
-    names = system.peer_types[group.peer_type].parameters
-    holder = {parameter.name: parameter for parameter in (*system.parameters, *group.values)}
+    names = model.peer_types[group.peer_type].parameters
+    holder = {parameter.name: parameter for parameter in (*model.parameters, *group.values)}
     common = np.array([[holder[name].value for name in names]], dtype=np.float64).reshape(1, -1)
-    columns = columns_of(system, group, names)
+    columns = columns_of(model, group, names)
     varying = {index: columns[name] for index, name in enumerate(names) if name in columns}
     if not varying:
         # A view of one zero: a million equal peers take no memory.
@@ -211,13 +211,13 @@ def rationals(vector: Floats) -> list[Fraction]:
 
 
 def free_rows(
-    system: Model, group: Group, peer: int, values: Mapping[ParameterRef, NDArray[Any]]
+    model: Model, group: Group, peer: int, values: Mapping[ParameterRef, NDArray[Any]]
 ) -> NDArray[Any]:
     """Return a peer's parameter vector for many values of some parameters, with their dependents.
 
     Parameters
     ----------
-    system
+    model
         The compiled model.
     group, peer
         The peer's group, and its number in the group, from 0.
@@ -229,7 +229,7 @@ def free_rows(
     -------
     The vectors (k, n_p), or (1, n_p) if none of the values applies to this peer.
     """
-    columns = free_values(system, group, peer, values, ROWS.__getitem__)
+    columns = free_values(model, group, peer, values, ROWS.__getitem__)
     count = max((len(item) for item in columns if np.ndim(item)), default=1)
     dtype = np.result_type(np.float64, *(item.dtype for item in columns if np.ndim(item)))
     rows = np.empty((count, len(columns)), dtype=dtype)
@@ -239,7 +239,7 @@ def free_rows(
 
 
 def free_values(
-    system: Model,
+    model: Model,
     group: Group,
     peer: int,
     values: Mapping[ParameterRef, Any],
@@ -250,18 +250,18 @@ def free_values(
 
     Parameters
     ----------
-    system, group, peer
+    model, group, peer
         As for `free_rows`.
     values
         The value of each free parameter.
     rule
         The operations of the number type, as of `expression_data.walk`.
     """
-    names = system.peer_types[group.peer_type].parameters
-    columns = columns_of(system, group, names, peer)
-    scope = scope_of(system, group.values, fixed={column.name for column in group.columns})
+    names = model.peer_types[group.peer_type].parameters
+    columns = columns_of(model, group, names, peer)
+    scope = scope_of(model, group.values, fixed={column.name for column in group.columns})
     given = with_times_of_groups(
-        system,
+        model,
         {parameter_ref.name: value for parameter_ref, value in values.items() if parameter_ref.group is None},
     )
     given |= {

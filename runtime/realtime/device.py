@@ -62,7 +62,7 @@ def device_function(path: Path) -> DeviceFunction:
 class ExternalDevice:
     """An external device in place of a peer's simulated device."""
 
-    def __init__(self, system: Model, member: GroupProgram, function: DeviceFunction) -> None:
+    def __init__(self, model: Model, member: GroupProgram, function: DeviceFunction) -> None:
         """Determine the device's states in the peer's equations.
 
         Raises
@@ -71,9 +71,9 @@ class ExternalDevice:
             E931 the peer has no device, or several candidates for a hand.
         """
         self.function = function
-        peer_type = system.groups[member.group].peer_type
-        self.device = devices_of(system, option="--device")[peer_type]
-        self.derivative = system.peer_types[peer_type].derivative
+        peer_type = model.groups[member.group].peer_type
+        self.device = devices_of(model, option="--device")[peer_type]
+        self.derivative = model.peer_types[peer_type].derivative
         self.parameters = member.parameters[member.rows[0]]
         self.before: tuple[float, float] | None = None
 

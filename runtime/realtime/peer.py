@@ -69,13 +69,13 @@ AHEAD = 1024  # packets whose random numbers are drawn in one batch
 AT_ONCE = 32
 
 
-def live_topology(system: Model) -> Model:
+def live_topology(model: Model) -> Model:
     """Return a model whose links receive packets as they arrive on the real network."""
-    timings = {timing.name: timing.value for timing in system.timings}
-    largest_delays = [max(timings[text] for text in link.delays) for link in system.links]
+    timings = {timing.name: timing.value for timing in model.timings}
+    largest_delays = [max(timings[text] for text in link.delays) for link in model.links]
     given_up = [[float(max(Fraction(GIVEN_UP), TIMES * delay))] for delay in largest_delays]
-    links = tuple(map(traced, system.links, given_up))
-    return replace(system, links=links, within=())
+    links = tuple(map(traced, model.links, given_up))
+    return replace(model, links=links, within=())
 
 
 def traced(link: Link, delays: Sequence[float] | Floats) -> Link:
@@ -99,7 +99,7 @@ class PeerLoop:
 
     def __init__(
         self,
-        system: Model,
+        model: Model,
         peer: str,
         listening: socket.socket,
         addresses: Mapping[str, Address],
@@ -116,7 +116,7 @@ class PeerLoop:
 
         Parameters
         ----------
-        system
+        model
             The model, with its parameter values.
         peer
             The peer's name, such as "left[1]".
@@ -143,13 +143,13 @@ class PeerLoop:
             E970 there is no such peer, E971 one that it sends to or receives from has no address; those of
             `prepare` and `means_at_joins`.
         """
-        self.system, self.name = system, peer
-        self.exchange = build_exchange(system, resolve(system).timings)
+        self.model, self.name = model, peer
+        self.exchange = build_exchange(model, resolve(model).timings)
         self.local = number_of(self.exchange, peer, "--peer")
         self.others = {number_of(self.exchange, text, "--to"): address for text, address in addresses.items()}
         settings = Settings(duration, jit=False, seed=seed)
-        self.simulation = prepare(live_topology(system), settings, signals=[f"{peer}.*"], live=True)
-        self.means = means_at_joins(system)
+        self.simulation = prepare(live_topology(model), settings, signals=[f"{peer}.*"], live=True)
+        self.means = means_at_joins(model)
         self.frame_ns = int(self.simulation.frame * self.simulation.quantum * NANO)
         self.frames = -(-int(duration * NANO) // self.frame_ns)
         self.post = Post(
@@ -218,7 +218,7 @@ class PeerLoop:
         )
         for is_wrong, message, fix, advice in wrong:
             if is_wrong:
-                location = SourceLocation("--to" if needed else self.system.name)
+                location = SourceLocation("--to" if needed else self.model.name)
                 raise ApcError(Diagnostic("E971", location, message, fix=fix, advice=advice))
 
     # ---- connection
@@ -387,7 +387,7 @@ class _SinglePeer(InterpretedEngine):
         self.begin_at = [0, *(int(number * self.quantum_ns) for number in instants_within(schedules))]
         self.links = [
             _LinkState(loop, period, index, clock)
-            for index, link in enumerate(loop.system.links)
+            for index, link in enumerate(loop.model.links)
             for clock in link.clocks
         ]
         self.link_of = {(link.location, sender): link for link in self.links for sender in link.arcs}
@@ -395,7 +395,7 @@ class _SinglePeer(InterpretedEngine):
         self.observed: list[list[tuple[Integers, Flags]]] = [[] for _ in self.routes]
         self.network = _EmulatedNetwork(loop) if emulate else None
         member = population.members[self.member]
-        self.outside = ExternalDevice(loop.system, member, device) if device else None
+        self.outside = ExternalDevice(loop.model, member, device) if device else None
         self.ahead: list[
             tuple[int, int, Data]
         ] = []  # packets not yet received by a tick, by sampling instant
@@ -567,7 +567,7 @@ class _SinglePeer(InterpretedEngine):
         """Store a packet that arrived at an instant of the session, unless its contents are invalid."""
         link = self.link_of.get((packet.link, packet.sender))
         if link is None:
-            absent = self.loop.simulation.presence and packet.link < len(self.loop.system.links)
+            absent = self.loop.simulation.presence and packet.link < len(self.loop.model.links)
             self.loop.post.drop("absent" if absent else "malformed")
             return
         if why := self._drop_reason(packet, came, link):
@@ -609,11 +609,11 @@ class _LinkState:
 
     def __init__(self, loop: PeerLoop, period: Period, index: int, clock_name: str) -> None:
         population, peers = period.simulation.population, period.peers
-        self.location, self.name = index, loop.system.links[index].name
-        link, timings = loop.system.links[index], resolve(loop.system).timings
+        self.location, self.name = index, loop.model.links[index].name
+        link, timings = loop.model.links[index], resolve(loop.model).timings
         self.own_clock = "" if clock_name == link.clock else clock_name
         stream = self.name, self.own_clock
-        clock = next(clock for clock in loop.system.clocks if clock.name == clock_name)
+        clock = next(clock for clock in loop.model.clocks if clock.name == clock_name)
         self.phase, self.period = (timings[text] * NANO for text in (clock.phase, clock.period))
         self.newest = link.channel is None or link.channel.reorder == "newest"
         self.slots = int(loop.simulation.frame * loop.simulation.quantum * NANO / self.period)
@@ -651,7 +651,7 @@ class _EmulatedNetwork:
 
     def __init__(self, loop: PeerLoop) -> None:
         self.loop = loop
-        self.timings = resolve(loop.system).timings
+        self.timings = resolve(loop.model).timings
         self.delays: dict[tuple[int, int], Iterator[tuple[int, float]]] = {}
 
     def delay(self, link: _LinkState, other: int, count: int) -> int | None:
@@ -668,11 +668,11 @@ class _EmulatedNetwork:
         A link without a declared channel has its nominal delay and no losses.
         """
         loop, exchange = self.loop, self.loop.exchange
-        arc, declared_link = (loop.local, receiver), loop.system.links[link.location]
+        arc, declared_link = (loop.local, receiver), loop.model.links[link.location]
         sender_group, receiver_group = map(exchange.group_of, arc)
         delay = exchange.delay(link.name, sender_group, receiver_group)
         law = channel_law(
-            loop.system,
+            loop.model,
             declared_link if declared_link.channel else traced(declared_link, [float(self.timings[delay])]),
             delay,
         )

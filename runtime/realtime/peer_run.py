@@ -99,7 +99,7 @@ class RealtimeRun:
     """The records of some or all peers of one run of a model."""
 
     folder: str
-    system: Model
+    model: Model
     peers: tuple[PeerRun, ...]
 
 
@@ -169,14 +169,14 @@ def check_folder(folder: Path, topology: Path) -> None:
     raise ApcError(Diagnostic("E973", SourceLocation(str(folder)), message, fix="--out another.run"))
 
 
-def write_run(folder: Path, system: Model, peers: Sequence[PeerRun], *, whole: bool = False) -> None:
+def write_run(folder: Path, model: Model, peers: Sequence[PeerRun], *, whole: bool = False) -> None:
     """Write the records of some peers to a folder.
 
     Parameters
     ----------
     folder
         The folder; created if missing.
-    system
+    model
         The model.
     peers
         The records of some or all peers.
@@ -192,9 +192,9 @@ def write_run(folder: Path, system: Model, peers: Sequence[PeerRun], *, whole: b
     try:
         with tempfile.TemporaryDirectory(prefix=f".{folder.name[:64]}.", dir=parent) as temporary:
             temporary_folder = Path(temporary)
-            store.save(system, temporary_folder / TOPOLOGY)
+            store.save(model, temporary_folder / TOPOLOGY)
             for peer in peers:
-                _write_peer(temporary_folder, peer, system)
+                _write_peer(temporary_folder, peer, model)
             folder.mkdir(exist_ok=True)
             written = {path.name for path in temporary_folder.iterdir()}
             for name in sorted(
@@ -208,7 +208,7 @@ def write_run(folder: Path, system: Model, peers: Sequence[PeerRun], *, whole: b
         raise unwritable(folder, error) from None
 
 
-def _write_peer(folder: Path, peer: PeerRun, system: Model) -> None:
+def _write_peer(folder: Path, peer: PeerRun, model: Model) -> None:
     """Write a peer's record, and the delay trace of each incoming directed link. Raises OSError."""
     record = msgspec.json.encode({field.name: getattr(peer, field.name) for field in fields(PeerRecord)})
     arrays = {name: getattr(peer, name) for name in ARRAYS}
@@ -221,7 +221,7 @@ def _write_peer(folder: Path, peer: PeerRun, system: Model) -> None:
             "lost" if math.isinf(value) else f"{value * 1e3:.6f}" for value in delays_of(peer, link, sender)
         )
         text = "\n".join(["delay [ms]", *rows, ""])
-        (folder / trace_name(system, link, sender, peer.number)).write_text(text, encoding="utf-8")
+        (folder / trace_name(model, link, sender, peer.number)).write_text(text, encoding="utf-8")
 
 
 def delays_of(peer: PeerRun, link: int, sender: int) -> Floats:
@@ -242,7 +242,7 @@ def file_name(peer: str) -> str:
     return peer.replace("[", "-").replace("]", "")
 
 
-def trace_name(system: Model, link: int, sender: int, receiver: int) -> str:
+def trace_name(model: Model, link: int, sender: int, receiver: int) -> str:
     """Return the name of the trace of a directed link."""
-    names = [f"{group.name}-{index + 1}" for group in system.groups for index in range(group.count)]
-    return f"{system.links[link].name}-{names[sender]}-to-{names[receiver]}.csv"
+    names = [f"{group.name}-{index + 1}" for group in model.groups for index in range(group.count)]
+    return f"{model.links[link].name}-{names[sender]}-to-{names[receiver]}.csv"

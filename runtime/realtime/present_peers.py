@@ -62,7 +62,7 @@ def periods_of(simulation: Simulation, local: int, frames: int) -> list[Period]:
         Those of `prepare` for the present peers.
     """
     presence, routes = simulation.presence, simulation.population.exchange_program.routes
-    counts = [group.count for group in simulation.system.groups]
+    counts = [group.count for group in simulation.model.groups]
     groups = np.repeat(range(len(counts)), counts)
     if presence is None:
         peers, none = np.arange(len(groups)), np.empty(0, np.int64)
@@ -77,7 +77,7 @@ def periods_of(simulation: Simulation, local: int, frames: int) -> list[Period]:
             continue
         peers = np.flatnonzero(present)
         index = int(np.searchsorted(peers, local))
-        name = simulation.system.groups[groups[local]].name
+        name = simulation.model.groups[groups[local]].name
         number = 1 + int((groups[peers[:index]] == groups[local]).sum())
         model = extension.model_of_present(simulation.topology, present)
         prepared = prepare(model, simulation.settings, signals=[f"{name}[{number}].*"], live=True)
@@ -88,15 +88,15 @@ def periods_of(simulation: Simulation, local: int, frames: int) -> list[Period]:
     return periods
 
 
-def means_at_joins(system: Model) -> list[dict[tuple[str, str], int]]:
+def means_at_joins(model: Model) -> list[dict[tuple[str, str], int]]:
     """Return by group the states that are means at a joining peer, by the link and channel that send them.
 
     Raises ApcError E914 for a value that is a mean at a joining peer, and is not sent unchanged to all peers.
     """
-    complete = {link.name for link in system.links if link.graph.shape == "complete"}
+    complete = {link.name for link in model.links if link.graph.shape == "complete"}
     result = []
-    for group in system.groups:
-        peer_type = system.peer_types[group.peer_type]
+    for group in model.groups:
+        peer_type = model.peer_types[group.peer_type]
         names = [name for name in stored_names(peer_type) if peer_type.joins_at_mean(name)]
         means = {
             channel: row
@@ -105,11 +105,11 @@ def means_at_joins(system: Model) -> list[dict[tuple[str, str], int]]:
             if channel[0] in complete and peer_type.states[row].name in names
         }
         sent = [peer_type.states[row].name for row in means.values()]
-        joins = [item for item in system.experiment.joins if item.peer.strip().startswith(f"{group.name}[")]
+        joins = [item for item in model.experiment.joins if item.peer.strip().startswith(f"{group.name}[")]
         if joins and (unsent := [name for name in names if name not in sent]):
             subject = f"joining of {unsent[0].partition('.')[0]} in apc run"
             expected = f"start, as {unsent[0]} is not sent to all peers"
-            location = location_of(system, "joins", joins[0])
+            location = location_of(model, "joins", joins[0])
             raise fault("E914", location, subject, expected, "mean", "joining: start")
         result.append(means)
     return result

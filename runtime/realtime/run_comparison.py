@@ -132,15 +132,15 @@ def compare_run(run: RealtimeRun) -> RunComparison:
     ApcError
         Those of `prepare`, for a model that cannot be simulated.
     """
-    system, peers = run.system, run.peers
+    model, peers = run.model, run.peers
     simulation = _prepared(run)
     frame = float(simulation.frame * simulation.quantum)
-    why_not, arcs = reason_not_simulated(system, peers, simulation), _arc_runs(run)
+    why_not, arcs = reason_not_simulated(model, peers, simulation), _arc_runs(run)
     received = [
-        [arc for arc in arcs if arc.link == link.name and arc.came.distribution] for link in system.links
+        [arc for arc in arcs if arc.link == link.name and arc.came.distribution] for link in model.links
     ]
     return RunComparison(
-        topology=system.name,
+        topology=model.name,
         folder=run.folder,
         seconds=max((float(peer.time[-1]) for peer in peers if len(peer.time)), default=0.0),
         emulated=any(peer.emulated for peer in peers),
@@ -149,8 +149,8 @@ def compare_run(run: RealtimeRun) -> RunComparison:
         differences={} if why_not else _differences(run, simulation),
         why_not=why_not,
         measured=tuple(
-            _measured_link(system, link, arc_runs)
-            for link, arc_runs in zip(system.links, received, strict=True)
+            _measured_link(model, link, arc_runs)
+            for link, arc_runs in zip(model.links, received, strict=True)
             if arc_runs
         ),
     )
@@ -158,33 +158,33 @@ def compare_run(run: RealtimeRun) -> RunComparison:
 
 def _prepared(run: RealtimeRun) -> Simulation:
     """Return the simulation of a run, with the joins and leaves that were recorded."""
-    system, duration = run.system, _duration(run.system, run.peers)
+    model, duration = run.model, _duration(run.model, run.peers)
     joins, leaves = (
         tuple(item for item in items if item.at < duration)
-        for items in (system.experiment.joins, system.experiment.leaves)
+        for items in (model.experiment.joins, model.experiment.leaves)
     )
-    recorded = replace(system, experiment=replace(system.experiment, joins=joins, leaves=leaves))
+    recorded = replace(model, experiment=replace(model.experiment, joins=joins, leaves=leaves))
     return prepare(live_topology(recorded), Settings(duration, jit=False))
 
 
-def _duration(system: Model, peers: tuple[PeerRun, ...]) -> Fraction:
+def _duration(model: Model, peers: tuple[PeerRun, ...]) -> Fraction:
     """Return the duration in seconds that all peers recorded, except those that leave."""
-    leaving = {item.peer.strip() for item in system.experiment.leaves}
+    leaving = {item.peer.strip() for item in model.experiment.leaves}
     ends = [float(peer.time[-1]) for peer in peers if len(peer.time) and peer.name not in leaving]
     return Fraction(max(min(ends, default=0.0), 1e-3)).limit_denominator(10**6)
 
 
 def reason_not_simulated(
-    system: Model, peers: tuple[PeerRun, ...], simulation: Simulation | None = None
+    model: Model, peers: tuple[PeerRun, ...], simulation: Simulation | None = None
 ) -> str:
     """Return the reason why the run cannot be simulated, "" if it can.
 
     `simulation` is that of the run, None if all peers are always present.
     """
     presence = simulation.presence if simulation else None
-    joins = presence.joins // simulation.frame if simulation and presence else np.zeros(system.peers)
-    if len(peers) < system.peers:
-        return f"only {len(peers)} of {system.peers} peers recorded the run"
+    joins = presence.joins // simulation.frame if simulation and presence else np.zeros(model.peers)
+    if len(peers) < model.peers:
+        return f"only {len(peers)} of {model.peers} peers recorded the run"
     if local := [peer.name for peer in peers if peer.outside]:
         return f"{', '.join(local)} had an external device with unknown motion"
     if none := [peer.name for peer in peers if not all(map(len, peer.packets))]:
@@ -247,14 +247,14 @@ def _differences(run: RealtimeRun, simulation: Simulation) -> dict[str, tuple[fl
 
 def _arc_runs(run: RealtimeRun) -> tuple[ArcRun, ...]:
     """Return the packets of each directed link, with statistics of their arrivals."""
-    system, peers = run.system, {peer.number: peer for peer in run.peers}
-    timings = {timing.name: float(timing.value) for timing in system.timings}
-    periods = {clock.name: timings[clock.period] for clock in system.clocks}
-    exchange = build_exchange(system, resolve(system).timings)
+    model, peers = run.model, {peer.number: peer for peer in run.peers}
+    timings = {timing.name: float(timing.value) for timing in model.timings}
+    periods = {clock.name: timings[clock.period] for clock in model.clocks}
+    exchange = build_exchange(model, resolve(model).timings)
     arc_runs = []
     for peer in run.peers:
         for number, sender in peer.arcs:
-            link, trace = system.links[number], trace_name(system, number, sender, peer.number)
+            link, trace = model.links[number], trace_name(model, number, sender, peer.number)
             other = peers.get(sender)
             clock = link.clock_at(
                 exchange.delay(link.name, exchange.group_of(sender), exchange.group_of(peer.number))
@@ -273,23 +273,23 @@ def _arc_runs(run: RealtimeRun) -> tuple[ArcRun, ...]:
     return tuple(arc_runs)
 
 
-def _measured_link(system: Model, link: Link, arcs: Sequence[ArcRun]) -> MeasuredLink:
+def _measured_link(model: Model, link: Link, arcs: Sequence[ArcRun]) -> MeasuredLink:
     """Return the analysis with the worst directed link of a network link: most losses, then largest delay."""
     worst = max(arcs, key=lambda arc: (arc.came.lost.value, arc.came.mean))
-    came, clocks = worst.came, {clock.name: clock.period for clock in system.clocks}
-    tick = min(float(timing.value) for timing in system.timings if timing.name in clocks.values())
+    came, clocks = worst.came, {clock.name: clock.period for clock in model.clocks}
+    tick = min(float(timing.value) for timing in model.timings if timing.name in clocks.values())
     median = dict(came.quantiles).get(0.5, came.mean)
     delay = Fraction(int(np.ceil(median / tick - 1e-9))) * Fraction(tick).limit_denominator(10**9)
     pairs = tuple(replace(pair, channel=None) for pair in link.pairs if pair.clock)
     replaced = {link.delay, *(pair.delay for pair in pairs)}
     timings = tuple(
-        replace(timing, value=delay) if timing.name in replaced else timing for timing in system.timings
+        replace(timing, value=delay) if timing.name in replaced else timing for timing in model.timings
     )
     periods = [clocks[name] for name in link.clocks]
     period = min(float(timing.value) for timing in timings if timing.name in periods)
     measured_link = replace(traced(link, came.delays), pairs=pairs)
-    links = tuple(measured_link if item is link else item for item in system.links)
-    measured_system = replace(system, timings=timings, links=links)
+    links = tuple(measured_link if item is link else item for item in model.links)
+    measured_system = replace(model, timings=timings, links=links)
     too_long = came.longest > LATEST * period or came.packets > LONGEST
     network = None if too_long else mean_square_stability(numeric_model(measured_system))
     arc = f"{worst.sender} to {worst.receiver}"

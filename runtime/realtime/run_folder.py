@@ -65,12 +65,12 @@ def read_run(folder: Path) -> RealtimeRun:
     none = f"has no run ({TOPOLOGY} and one file for each peer, as written by apc run)"
     refuse(not (folder / TOPOLOGY).is_file() or not files, none, "apc run FILE --out RUN")
     archive = read_archive(folder / TOPOLOGY)
-    system = loaded_model(archive, folder)
-    many = f"has {counted(len(files), 'peer', ',')} of a topology with {system.peers:,}"
-    refuse(len(files) > system.peers, many)
-    names = tuple(f"{group.name}[{index + 1}]" for group in system.groups for index in range(group.count))
-    simulation = prepare(live_topology(always_present(system)), Settings(Fraction(1, 1000), jit=False))
-    topology = _Topology(names, tuple(link.name for link in system.links), simulation)
+    model = loaded_model(archive, folder)
+    many = f"has {counted(len(files), 'peer', ',')} of a topology with {model.peers:,}"
+    refuse(len(files) > model.peers, many)
+    names = tuple(f"{group.name}[{index + 1}]" for group in model.groups for index in range(group.count))
+    simulation = prepare(live_topology(always_present(model)), Settings(Fraction(1, 1000), jit=False))
+    topology = _Topology(names, tuple(link.name for link in model.links), simulation)
     peers = tuple(
         sorted((_read_peer(path, topology) for path in files), key=lambda peer_run: peer_run.number)
     )
@@ -79,7 +79,7 @@ def read_run(folder: Path) -> RealtimeRun:
     played = hashlib.sha256(archive.model).hexdigest()
     refuse(peers[0].digest != played, f"its {TOPOLOGY} is not the topology of the run")
     refuse(len({peer.number for peer in peers}) < len(peers), "contains a peer twice")
-    return RealtimeRun(str(folder), system, peers)
+    return RealtimeRun(str(folder), model, peers)
 
 
 def _read_peer(path: Path, topology: _Topology) -> PeerRun:

@@ -113,7 +113,7 @@ def is_loopback(address: Address) -> bool:
 
 
 def run_single(
-    system: Model,
+    model: Model,
     peer: str,
     listening: socket.socket,
     addresses: Mapping[str, Address],
@@ -125,7 +125,7 @@ def run_single(
 
     Parameters
     ----------
-    system, peer, listening, addresses, device
+    model, peer, listening, addresses, device
         As for `PeerLoop`.
     how
         The options of the session.
@@ -137,10 +137,10 @@ def run_single(
     ApcError
         Those of `PeerLoop` and `PeerLoop.meet`.
     """
-    digest = digest_of(system)
+    digest = digest_of(model)
     with _stop_on_interrupt() if stop is None else nullcontext(stop) as stop_connection:
         loop = PeerLoop(
-            *(system, peer, listening, addresses),
+            *(model, peer, listening, addresses),
             digest=digest,
             duration=how.duration,
             secret=how.secret,
@@ -178,7 +178,7 @@ def _stop_on_interrupt() -> Iterator[Connection]:
         stop.close()
 
 
-def run_all(system: Model, how: LocalRun) -> tuple[RunPart, ...]:
+def run_all(compiled_model: Model, how: LocalRun) -> tuple[RunPart, ...]:
     """Return the records of all peers, run on loopback in a process each; Ctrl-C ends all peers.
 
     A process that crashes, or does not end, has the trouble E975 in its own record.
@@ -188,19 +188,22 @@ def run_all(system: Model, how: LocalRun) -> tuple[RunPart, ...]:
     ApcError
         E975 too many peers.
     """
-    exchange = build_exchange(system, resolve(system).timings)
+    exchange = build_exchange(compiled_model, resolve(compiled_model).timings)
     if exchange.peers > MOST_PEERS:
         message = f"{exchange.peers:,} peers need as many processes; the limit is {MOST_PEERS}"
         raise ApcError(
             Diagnostic(
-                "E975", SourceLocation(system.name), message, advice="start each peer with --peer NAME"
+                "E975",
+                SourceLocation(compiled_model.name),
+                message,
+                advice="start each peer with --peer NAME",
             )
         )
     names = [exchange.peer_name(index) for index in range(exchange.peers)]
     sockets = {name: listen_at((LOOPBACK, 0)) for name in names}
     addresses = {name: listening.getsockname() for name, listening in sockets.items()}
     stop, end = multiprocessing.Pipe(duplex=False)
-    model, parts, patience = model_bytes(system), [], None
+    model, parts, patience = model_bytes(compiled_model), [], None
     running: dict[Future[RunPart], tuple[str, Workers[str, RunPart]]] = {}
     with ExitStack() as stack:
         for name, listening in sockets.items():  # a pool for each process, as a crash breaks the pool
@@ -258,5 +261,5 @@ class _ProcessData:
 def _run_peer(shared: _ProcessData, name: str) -> RunPart:
     """Return the record of one peer, run in this process."""
     addresses = {other: address for other, address in shared.addresses.items() if other != name}
-    system = model_of_bytes(shared.model)
-    return run_single(system, name, shared.listening, addresses, shared.how, shared.stop)
+    model = model_of_bytes(shared.model)
+    return run_single(model, name, shared.listening, addresses, shared.how, shared.stop)

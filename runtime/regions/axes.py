@@ -28,13 +28,13 @@ _FORM = "contact.stiffness=10 N/m:3000 N/m"
 
 
 def parse_axes(
-    system: Model, x: str | NamedValues | None, y: str | NamedValues | None, *, scale: Fraction = Fraction(1)
+    model: Model, x: str | NamedValues | None, y: str | NamedValues | None, *, scale: Fraction = Fraction(1)
 ) -> tuple[Range, Range]:
     """Return the two axes of a region from texts `PATH=LOW:HIGH`, by default the model's own axes.
 
     Parameters
     ----------
-    system
+    model
         The model.
     x, y
         Texts such as `contact.stiffness=10 N/m:3000 N/m`, or names with the two ends; None is the axis of
@@ -50,25 +50,25 @@ def parse_axes(
     """
     intervals = []
     for letter, given, index in (("x", x, 0), ("y", y, 1)):
-        if given is None and len(system.region) == 2:
-            local = system.region[index]
+        if given is None and len(model.region) == 2:
+            local = model.region[index]
             given = local.parameter, (local.low, local.high)
         if given is None:
             message = f"--{letter} is missing, and the topology has no studies.region"
             other = named_values((y if letter == "x" else x) or "")[0]
-            fix = f'--{letter} "{proposed_range(system, without=other)}"'
+            fix = f'--{letter} "{proposed_range(model, without=other)}"'
             raise ApcError(Diagnostic("E901", LOCATION, message, fix=fix))
         name, span = named_values(given)
         if not name or (span.count(":") != 1 if isinstance(span, str) else len(span) != 2):
             fix, got = f'--{letter} "{_FORM}"', str(given)[:80] or "nothing"
             raise ApcError(Diagnostic("E901", LOCATION, f"--{letter}", "PATH=LOW:HIGH", got, fix))
         try:
-            axis = parse_axis(system, name, span, ends=True)
+            axis = parse_axis(model, name, span, ends=True)
         except ApcError as error:
             raise ApcError(
                 replace(mistake, location=SourceLocation(f"--{letter}")) for mistake in error.mistakes
             ) from None
-        refuse_phase(system, axis.free, LOCATION, code="E903")
+        refuse_phase(model, axis.free, LOCATION, code="E903")
         low, high = axis.values[0], axis.values[-1]
         least = NARROWEST * max(abs(low), abs(high))
         if high - low < least:
@@ -77,7 +77,7 @@ def parse_axes(
             raise ApcError(Diagnostic("E903", SourceLocation(f"--{letter}"), message, expected, got))
         intervals.append(Range(axis.free, axis.unit, axis.values[0], axis.values[-1]))
     first, second = intervals
-    if overlap(system, first.free, second.free):
+    if overlap(model, first.free, second.free):
         item, other = first.free.label, second.free.label
         message = f"{item} is on both axes; a region needs two parameters"
         if item != other:

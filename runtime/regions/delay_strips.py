@@ -113,9 +113,9 @@ def trace_delay_strips(
     ApcError
         E844 a time that is not linear in the delay.
     """
-    system = numeric.model
+    model = numeric.model
     delay, other = axes[axis], axes[1 - axis]
-    is_period = kind_for_parameter(system, delay.free) is EvaluatorKind.PERIODS
+    is_period = kind_for_parameter(model, delay.free) is EvaluatorKind.PERIODS
     strips: list[_Strip] = []
     for strip in _delay_strips(numeric, delay, other, cells, tolerance, progress):
         if strip is None:
@@ -162,11 +162,11 @@ def _delay_strips(
     progress: Callable[[str], None] | None,
 ) -> Iterator[_Strip | None]:
     """Yield the strips in order; None for a strip without a closed form."""
-    system = numeric.model
-    kind = kind_for_parameter(system, delay.free)
+    model = numeric.model
+    kind = kind_for_parameter(model, delay.free)
     if kind is not EvaluatorKind.DELAYS:
         segments_of = count_segments if kind is EvaluatorKind.COUNTS else period_segments
-        for segment in segments_of(system, delay, LOCATION):
+        for segment in segments_of(model, delay, LOCATION):
             ends = [
                 float((number - delay.low) / (delay.high - delay.low))
                 for number in (segment.low, segment.high)
@@ -174,10 +174,10 @@ def _delay_strips(
             yield _delay_independent_strip(segment, other, ends, numeric)
         return
     # An oversized problem is refused before any strip is analyzed.
-    longest = system_with_delay(system, delay.free, delay.high)
+    longest = system_with_delay(model, delay.free, delay.high)
     evaluator_of_many(numeric.at(longest), [other.free], LOCATION)
     report_progress = delay_progress(
-        system, delay.free, delay.low, delay.high, location=LOCATION, progress=progress
+        model, delay.free, delay.low, delay.high, location=LOCATION, progress=progress
     )
     for segment in delay_segments(numeric, delay.free, delay.low, location=LOCATION, high=delay.high):
         high = min(segment.high, delay.high)

@@ -147,13 +147,13 @@ def compare_regions(
     for settings in panels:
         prepared_models: list[_Work] = []
         for index, original in enumerate(systems):
-            system = apply(original, [parse_override(original, text) for text in settings])
+            model = apply(original, [parse_override(original, text) for text in settings])
             if index and len(systems[0].region) == 2:
-                system = replace(system, region=systems[0].region)
-            axes = parse_axes(system, x, y)
-            _refuse_setting_of_axis(axes, system, settings)
-            gain = gain_factor(system, axes[1]) if normalize else 1
-            prepared_models.append((system, parse_axes(system, x, y, scale=Fraction(gain)), gain))
+                model = replace(model, region=systems[0].region)
+            axes = parse_axes(model, x, y)
+            _refuse_setting_of_axis(axes, model, settings)
+            gain = gain_factor(model, axes[1]) if normalize else 1
+            prepared_models.append((model, parse_axes(model, x, y, scale=Fraction(gain)), gain))
         jobs.append(
             (
                 ", ".join(settings),
@@ -164,8 +164,8 @@ def compare_regions(
     result = []
     for title, prepared_models, overlays_of_panel in jobs:
         regions = tuple(
-            region(numeric_model(system), axes, cells=cells, criterion=criterion, progress=progress)
-            for system, axes, _ in prepared_models
+            region(numeric_model(model), axes, cells=cells, criterion=criterion, progress=progress)
+            for model, axes, _ in prepared_models
         )
         first_model, axes, gain = prepared_models[0]
         overlay_curves = tuple(
@@ -177,20 +177,20 @@ def compare_regions(
     return Panels(tuple(result), normalize)
 
 
-def _refuse_setting_of_axis(axes: Sequence[Range], system: Model, settings: Sequence[str]) -> None:
+def _refuse_setting_of_axis(axes: Sequence[Range], model: Model, settings: Sequence[str]) -> None:
     """Raise E902 if a panel sets the parameter of an axis."""
     for text in settings:
-        parameter_ref = parse_override(system, text).free
+        parameter_ref = parse_override(model, text).free
         for axis in axes:
             same_parameter = (
                 parameter_ref.group in (None, axis.free.group) and axis.free.name == parameter_ref.name
             )
-            if same_parameter or axis.free.name in times_of(system, parameter_ref.name):
+            if same_parameter or axis.free.name in times_of(model, parameter_ref.name):
                 message = f"{axis.free.label} is both on an axis and set for the panel"
                 raise ApcError(Diagnostic("E902", LOCATION, message))
 
 
-def gain_factor(system: Model, axis: Range) -> int:
+def gain_factor(model: Model, axis: Range) -> int:
     """Return the gain factor of a parameter: the number of other peers for a sum, 1 for a mean.
 
     The mean over N − 1 other peers is their sum with the gain divided by N − 1. The received values with this
@@ -201,13 +201,13 @@ def gain_factor(system: Model, axis: Range) -> int:
     ApcError
         E906 a parameter of a sum and a mean, another operator, or peers with unequal numbers of senders.
     """
-    numbers_before = resolve(system)
+    numbers_before = resolve(model)
     value = axis.low + (axis.high - axis.low) * (MOVE - 1)
-    numbers_after = resolve(apply(system, [Override(axis.free, value)]))
-    exchange = build_exchange(system, numbers_before.timings)
+    numbers_after = resolve(apply(model, [Override(axis.free, value)]))
+    exchange = build_exchange(model, numbers_before.timings)
     factors: set[int] = set()
-    subsystems = linear_subsystems(system, numbers_before.timings)
-    for index, group in enumerate(system.groups):
+    subsystems = linear_subsystems(model, numbers_before.timings)
+    for index, group in enumerate(model.groups):
         subsystem = subsystems[group.peer_type]
         if not subsystem.parameters_suffice:
             message = "the topology has individual weights, so an effective gain is undefined"
@@ -224,9 +224,9 @@ def gain_factor(system: Model, axis: Range) -> int:
                 if receive.operator == "mean":
                     factors.add(1)
                 elif exchange.is_complete(receive.link):
-                    factors.add(system.peers - 1)
+                    factors.add(model.peers - 1)
                 else:
-                    received = np.bincount(exchange.arcs(receive.link)[0][:, 1], minlength=system.peers)
+                    received = np.bincount(exchange.arcs(receive.link)[0][:, 1], minlength=model.peers)
                     factors |= set(received.tolist())
     if len(factors) > 1:
         message = (

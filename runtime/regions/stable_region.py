@@ -181,7 +181,7 @@ class Region(Result):
     linearized: bool
     criterion: str
     limitations: tuple[str, ...]
-    system: Model
+    model: Model
 
     @property
     def coarse(self) -> tuple[Curve, ...]:
@@ -277,18 +277,18 @@ def region(
     axis is analyzed point by point if its neutral modes change. With passive hands points on the boundary are
     joined by straight segments, with errors estimated at their middles.
     """
-    system = numeric.model
+    model = numeric.model
     parameter_refs = tuple(axis.free for axis in axes)
-    chosen_criterion = criterion_of(system, criterion, LOCATION, parameter_refs)
+    chosen_criterion = criterion_of(model, criterion, LOCATION, parameter_refs)
     tolerance = tolerance or (TOLERANCE_OF_DIFFERENCES if chosen_criterion in SCALAR_CRITERIA else TOLERANCE)
     for parameter_ref in parameter_refs:
         if chosen_criterion == NOMINAL:
-            refuse_channel_number(system, parameter_ref, LOCATION, instead=f"--criterion {MEAN_SQUARE}")
+            refuse_channel_number(model, parameter_ref, LOCATION, instead=f"--criterion {MEAN_SQUARE}")
         else:
-            refuse_timing_parameter(system, parameter_ref, LOCATION, chosen_criterion)
+            refuse_timing_parameter(model, parameter_ref, LOCATION, chosen_criterion)
     rectangle = rectangle_of(*axes)
-    with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
-        kinds = [kind_for_parameter(system, parameter_ref) for parameter_ref in parameter_refs]
+    with single_threaded(), finite_equations(model.origin.topology), np.errstate(all="ignore"):
+        kinds = [kind_for_parameter(model, parameter_ref) for parameter_ref in parameter_refs]
         timed = [index for index, kind in enumerate(kinds) if kind is not EvaluatorKind.MATRICES]
         counts = [axes[index] for index in timed if kinds[index] is EvaluatorKind.COUNTS]
         if counts:
@@ -298,10 +298,10 @@ def region(
         timed = [] if chosen_criterion in SCALAR_CRITERIA else timed
         # If every time scales with a period, frames differ in their length only.
         scales = [kinds[index] for index in timed] == [EvaluatorKind.PERIODS] and is_scaled(
-            system, parameter_refs[timed[0]], delays=True
+            model, parameter_refs[timed[0]], delays=True
         )
         times = [] if scales else timed
-        _refuse_two_times(system, [parameter_refs[index] for index in times])
+        _refuse_two_times(model, [parameter_refs[index] for index in times])
         linearized = evaluator_for(numeric, parameter_refs, chosen_criterion).linearized
         if len(linearized) > 1 and _number_of_sides_changes(numeric, parameter_refs, rectangle):
             linearized = ()
@@ -317,7 +317,7 @@ def region(
                 )
         else:
             source = JoinedEvaluator(
-                system,
+                model,
                 parameter_refs,
                 tuple(evaluator_of_many(start, parameter_refs, LOCATION) for start in linearized),
             )
@@ -337,7 +337,7 @@ def region(
         curves = tuple(_curve(plane, arc, chosen_criterion) for arc in traced_region.arcs)
     area_unit = float(rectangle.width.prod())
     return Region(
-        topology=system.name,
+        topology=model.name,
         x=axes[0],
         y=axes[1],
         curves=curves,
@@ -355,11 +355,11 @@ def region(
         criterion=chosen_criterion,
         limitations=(
             *near_start(numeric),
-            *limitations(system, network=chosen_criterion != MEAN_SQUARE, varied=parameter_refs),
-            *(replaced_hands(system) if chosen_criterion == PASSIVE else ()),
-            *notes_for_all_groups(system, parameter_refs),
+            *limitations(model, network=chosen_criterion != MEAN_SQUARE, varied=parameter_refs),
+            *(replaced_hands(model) if chosen_criterion == PASSIVE else ()),
+            *notes_for_all_groups(model, parameter_refs),
         ),
-        system=system,
+        model=model,
     )
 
 
@@ -374,14 +374,14 @@ def _number_of_sides_changes(
     return any(len(sides(changed)) != len(sides(numeric)) for changed in elsewhere)
 
 
-def _refuse_two_times(system: Model, times: Sequence[ParameterRef]) -> None:
+def _refuse_two_times(model: Model, times: Sequence[ParameterRef]) -> None:
     """Raise ApcError E903 for a period together with another time, unless all clocks scale with the
     period.
     """
     if len(times) < 2:
         return
     for parameter_ref in times:
-        if reaches_period(system, parameter_ref) and not is_scaled(system, parameter_ref):
+        if reaches_period(model, parameter_ref) and not is_scaled(model, parameter_ref):
             message = f"{parameter_ref.label} is a period and the other axis a time; the frames are too long"
             raise ApcError(Diagnostic("E903", LOCATION, message, fix=f"apc critical {parameter_ref.label}"))
 
@@ -503,8 +503,8 @@ def _log_magnitudes_at(plane: _Plane, points: Floats) -> Floats:
         invalid = np.flatnonzero(~np.isfinite(matrix).all(axis=(1, 2)))
         if len(invalid):
             value = rectangle.values(points[invalid[:1]])[0].tolist()
-            overrides = overrides_at(source.system, source.free, value)
-            apply(source.system, overrides)  # raises its own error for an invalid value
+            overrides = overrides_at(source.model, source.free, value)
+            apply(source.model, overrides)  # raises its own error for an invalid value
             if plane.closed_at is not None:
                 plane.closed_at(value)
             message = "floating-point overflow in a part of the rectangle"
@@ -590,10 +590,10 @@ def side_of_curves(region: Region, points: Floats) -> tuple[NDArray[np.bool_], N
 
 def _stable_by_analysis(region: Region, values: Floats) -> NDArray[np.bool_]:
     """Return whether parameter values (k, 2) are stable, by one analysis each."""
-    numeric = numeric_model(region.system)
+    numeric = numeric_model(region.model)
     decided = []
     for value in values.tolist():
-        overrides = overrides_at(region.system, (region.x.free, region.y.free), value)
+        overrides = overrides_at(region.model, (region.x.free, region.y.free), value)
         verdict = verdict_with(numeric, overrides, LOCATION, criterion=region.criterion)
         decided.append(bool(verdict.stable))
     return np.array(decided, dtype=bool)

@@ -110,7 +110,7 @@ def report(paths: Sequence[Path], settings: Sequence[str] = ()) -> Report:
         A file or a setting is invalid.
     """
     systems = [open_topology(str(path), settings) for path in paths]
-    topologies = tuple(_topology(path, system, settings) for path, system in zip(paths, systems, strict=True))
+    topologies = tuple(_topology(path, model, settings) for path, model in zip(paths, systems, strict=True))
     comparison, refused = None, ""
     if len(systems) > 1:
         try:
@@ -131,7 +131,7 @@ def _versions() -> tuple[tuple[str, str], ...]:
     return tuple(result)
 
 
-def _topology(path: Path, system: Model, settings: Sequence[str]) -> TopologyReport:
+def _topology(path: Path, model: Model, settings: Sequence[str]) -> TopologyReport:
     """Return the report of one topology, with all sections."""
     words = " ".join(f"--set {shlex.quote(text)}" for text in settings)
     call = f"{shlex.quote(path.name)} {words}".strip()
@@ -147,12 +147,12 @@ def _topology(path: Path, system: Model, settings: Sequence[str]) -> TopologyRep
     sections = []
     for key, make in section_builders:
         try:
-            sections.append(make(system, call))
+            sections.append(make(model, call))
         except ApcError as error:
             sections.append(Section(key, "", refused=_error_text(error)))
-    texts = tuple(_texts(system))
-    description = (system.name, system.description, path)
-    return TopologyReport(*description, tuple(settings), texts, system.origin.digests, tuple(sections))
+    texts = tuple(_texts(model))
+    description = (model.name, model.description, path)
+    return TopologyReport(*description, tuple(settings), texts, model.origin.digests, tuple(sections))
 
 
 def _error_text(error: ApcError) -> str:
@@ -162,9 +162,9 @@ def _error_text(error: ApcError) -> str:
     return f"{mistake.message}{requested}"
 
 
-def _texts(system: Model) -> Iterable[tuple[str, str]]:
+def _texts(model: Model) -> Iterable[tuple[str, str]]:
     """Yield the names and texts of a topology's own files: the topology, its tables, its components."""
-    for name, text in system.origin.texts:
+    for name, text in model.origin.texts:
         if PurePath(name).suffix and not name.endswith("/"):
             yield name, text.decode()
 
@@ -172,53 +172,51 @@ def _texts(system: Model) -> Iterable[tuple[str, str]]:
 # ---- the sections ----
 
 
-def _compiled(system: Model, call: str) -> Section:
+def _compiled(model: Model, call: str) -> Section:
     """Return the section of the compiled model: warnings, unused items, and size."""
-    remarks = [f"Warning: {warning}" for warning in system.warnings]
-    remarks += [f"omitted: {name}, as {reason}" for name, reason in system.dropped]
-    return Section(
-        "compiled", f"apc compile {call.split(' --set')[0]}", tuple(remarks), (model_size(system),)
-    )
+    remarks = [f"Warning: {warning}" for warning in model.warnings]
+    remarks += [f"omitted: {name}, as {reason}" for name, reason in model.dropped]
+    return Section("compiled", f"apc compile {call.split(' --set')[0]}", tuple(remarks), (model_size(model),))
 
 
-def _analysis(system: Model) -> tuple[AnalysisReport, str]:
+def _analysis(model: Model) -> tuple[AnalysisReport, str]:
     """Return the analysis, proved if possible, and the option for the proof."""
     try:
-        return answer(system, certify=True), " --certify"
+        return answer(model, certify=True), " --certify"
     except ApcError:
-        return answer(system), ""
+        return answer(model), ""
 
 
-def _verdict(system: Model, call: str) -> Section:
+def _verdict(model: Model, call: str) -> Section:
     """Return the section of the verdict, with the eigenvalues as figure."""
-    answer, option = _analysis(system)
+    answer, option = _analysis(model)
     command = f"apc analyze {call}{option} --plot eigenvalues.svg"
     return Section("verdict", command, (), (answer,), (answer.analysis,))
 
 
-def _limits(system: Model, call: str) -> Section:
+def _limits(model: Model, call: str) -> Section:
     """Return the section of the critical stiffness and delay."""
-    parameters = [(axis, choice.name, choice.why) for axis, choice in choose(system, ()).items()]
-    return _criticals(system, call, "limits", [item for item in parameters if item[0] in (STIFFNESS, DELAY)])
+    parameters = [(axis, choice.name, choice.why) for axis, choice in choose(model, ()).items()]
+    return _criticals(model, call, "limits", [item for item in parameters if item[0] in (STIFFNESS, DELAY)])
 
 
-def _network(system: Model, call: str) -> Section:
+def _network(model: Model, call: str) -> Section:
     """Return the section of the lossy network: mean-square stability, critical loss and jitter."""
-    loss = choose(system, ())[LOSS]
-    channels = [channel for link in system.links for channel in link.channels]
+    loss = choose(model, ())[LOSS]
+    channels = [channel for link in model.links for channel in link.channels]
     names = dict.fromkeys(channel.jitter for channel in channels if channel.jitter is not None)
     jitters = [(JITTER, name, "") for name in names]
     return _criticals(
-        system,
+        model,
         call,
         "network",
         [(LOSS, loss.name, loss.why), *jitters],
-        mean_square_stability(numeric_model(system)),
+        mean_square_stability(numeric_model(model)),
     )
 
 
 def _criticals(
-    system: Model,
+    model: Model,
     call: str,
     key: str,
     parameters: Sequence[tuple[str, str, str]],
@@ -228,7 +226,7 @@ def _criticals(
 
     Parameters
     ----------
-    system, call
+    model, call
         The model, and the arguments of the commands.
     key
         The key of the section.
@@ -242,7 +240,7 @@ def _criticals(
     commands = [] if verdict is None else [f"apc analyze {call}"]
     for axis, name, why in parameters:
         try:
-            result = critical(system, name) if name else None
+            result = critical(model, name) if name else None
         except ApcError as error:
             result, why = None, _error_text(error)
         if result is None:
@@ -257,26 +255,26 @@ def _criticals(
     return Section(key, " && ".join(commands), tuple(remarks), tuple(results), tuple(plotted))
 
 
-def _region(system: Model, call: str) -> Section:
+def _region(model: Model, call: str) -> Section:
     """Return the section of the stable region of two parameters."""
     axis_texts: list[str | None] = [None, None]
-    if len(system.region) < 2:
+    if len(model.region) < 2:
         stiff = [
             parameter_ref
-            for parameter_ref in coupler_parameters(system)
-            if unit_of(system, parameter_ref.name) in STIFFNESSES
+            for parameter_ref in coupler_parameters(model)
+            if unit_of(model, parameter_ref.name) in STIFFNESSES
         ]
         if len(stiff) < 2:
             why = "fewer than two stiffnesses are common to all peers; the topology has no studies.region"
             return Section("region", "", refused=why)
         axis_texts = [
-            f"{parameter_ref.label}=0 N/m:{FURTHER * parameter_of(system, parameter_ref).value or 1000:g} N/m"
+            f"{parameter_ref.label}=0 N/m:{FURTHER * parameter_of(model, parameter_ref).value or 1000:g} N/m"
             for parameter_ref in stiff[:2]
         ]
-    unreliable = any(link.channel is not None for link in system.links)
+    unreliable = any(link.channel is not None for link in model.links)
     criterion = NOMINAL if unreliable else None
-    axes = parse_axes(system, *axis_texts)
-    result = region(numeric_model(system), axes, criterion=criterion)
+    axes = parse_axes(model, *axis_texts)
+    result = region(numeric_model(model), axes, criterion=criterion)
     words = [f" --{axis} {shlex.quote(text)}" for axis, text in zip("xy", axis_texts, strict=True) if text]
     words += [f" --criterion {NOMINAL}"] if criterion else []
     command = f"apc region {call}{''.join(words)} --out region.svg"
@@ -285,20 +283,20 @@ def _region(system: Model, call: str) -> Section:
     return Section("region", command, (text,) if unreliable else (), (result,), (result,))
 
 
-def _response(system: Model, call: str) -> Section:
+def _response(model: Model, call: str) -> Section:
     """Return the section of the simulation; a model at rest is simulated with an impulse."""
-    if system.peers > MOST_SIMULATED:
+    if model.peers > MOST_SIMULATED:
         why = (
-            f"{counted(system.peers, 'peer', ',')} exceed the limit of {MOST_SIMULATED} for a "
+            f"{counted(model.peers, 'peer', ',')} exceed the limit of {MOST_SIMULATED} for a "
             "simulation in a report"
         )
         return Section("response", "", refused=f"{why}; use apc simulate")
-    duration, remarks = system.experiment.duration, []
+    duration, remarks = model.experiment.duration, []
     length = "" if duration else f" --duration {shlex.quote(f'{float(WATCHED):g} s')}"
-    trajectory = simulate(system, duration=duration or WATCHED)
+    trajectory = simulate(model, duration=duration or WATCHED)
     if trajectory.summary.verdict is MotionVerdict.AT_REST:
         try:
-            struck, subject = initial_velocity(system)
+            struck, subject = initial_velocity(model)
         except ApcError as error:
             remarks.append(_error_text(error))
         else:
@@ -309,11 +307,11 @@ def _response(system: Model, call: str) -> Section:
     return Section("response", command, tuple(remarks), (trajectory,), (trajectory,))
 
 
-def _transparency(system: Model, call: str) -> Section:
+def _transparency(model: Model, call: str) -> Section:
     """Return the section of the transparency."""
     low, count = TRANSPARENCY
-    frequencies = read_frequencies(system, None, low, None, count)
-    result = transparency(numeric_model(system), frequencies)
+    frequencies = read_frequencies(model, None, low, None, count)
+    result = transparency(numeric_model(model), frequencies)
     return Section(
         "transparency",
         f"apc transparency {call} --points {count} --out transparency.svg",

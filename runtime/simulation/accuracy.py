@@ -111,7 +111,7 @@ def compare_with(simulation: Simulation, *, signals: Sequence[str] = ()) -> Accu
         The patterns of the recorded signals, as for `prepare`.
     """
     method, factor = finer(simulation.settings.method, all_linear=not simulation.tolerances)
-    closer = prepare(simulation.system, replace(simulation.settings, method=method), signals=signals)
+    closer = prepare(simulation.model, replace(simulation.settings, method=method), signals=signals)
     if method.perturbed:
         return AccuracyEstimator(closer, "rounding", "coefficients off by one rounding", factor)
     if method.step is not None:

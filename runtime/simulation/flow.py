@@ -216,13 +216,13 @@ def integrals(rate: Any) -> tuple[tuple[int, int], ...]:
 
 
 def state_scales(
-    system: Model, peer_type: PeerType, subsystem: SubsystemJacobians, vectors: Sequence[Floats]
+    model: Model, peer_type: PeerType, subsystem: SubsystemJacobians, vectors: Sequence[Floats]
 ) -> Floats:
     """Return the scale, the typical magnitude, of every state (n_x,), in SI.
 
     Parameters
     ----------
-    system
+    model
         The model.
     peer_type
         One of its peer types.
@@ -231,8 +231,8 @@ def state_scales(
     vectors
         The parameter vectors (n_p,) of its different peers.
     """
-    units = {parameter.name: parameter.unit for parameter in system.parameters}
-    units |= {value.name: value.unit for group in system.groups for value in group.values}
+    units = {parameter.name: parameter.unit for parameter in model.parameters}
+    units |= {value.name: value.unit for group in model.groups for value in group.values}
     largest: dict[str, float] = {}
     for index, name in enumerate(peer_type.parameters):
         size = max((abs(float(vector[index])) for vector in vectors), default=0.0)

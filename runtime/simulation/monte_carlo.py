@@ -166,7 +166,7 @@ def share_interval(count: int, total: int) -> tuple[float, float]:
 
 @part("simulate")
 def simulate_many(
-    system: Model,
+    model: Model,
     settings: Settings,
     *,
     runs: int,
@@ -177,7 +177,7 @@ def simulate_many(
 
     Parameters
     ----------
-    system
+    model
         The model.
     settings
         The settings of each run; run k of a seed is reproducible.
@@ -195,21 +195,21 @@ def simulate_many(
         the errors of `simulation.prepare`.
     """
     refuse_beyond(
-        RUN * runs, "E876", SourceLocation(system.origin.topology), f"{runs:,} runs", "reduce --runs"
+        RUN * runs, "E876", SourceLocation(model.origin.topology), f"{runs:,} runs", "reduce --runs"
     )
-    if not any(link.channel is not None for link in system.links):
-        message = f"no part of {system.name} is random: all runs are identical"
-        advice = f"write loss or jitter at link {system.links[0].name}, or " if system.links else ""
+    if not any(link.channel is not None for link in model.links):
+        message = f"no part of {model.name} is random: all runs are identical"
+        advice = f"write loss or jitter at link {model.links[0].name}, or " if model.links else ""
         advice += "omit --runs"
-        raise ApcError(Diagnostic("E894", SourceLocation(system.origin.topology), message, advice=advice))
-    seed = system.experiment.seed if settings.seed is None else settings.seed
+        raise ApcError(Diagnostic("E894", SourceLocation(model.origin.topology), message, advice=advice))
+    seed = model.experiment.seed if settings.seed is None else settings.seed
     settings = replace(settings, seed=seed)
     tasks = [range(first, min(first + PART, runs)) for first in range(0, runs, PART)]
-    location = SourceLocation(system.origin.topology)
+    location = SourceLocation(model.origin.topology)
     finished: list[EnsembleRun] = []
     interrupted = False
     try:
-        with _workers(system, settings, min(jobs, len(tasks)), location) as workers:
+        with _workers(model, settings, min(jobs, len(tasks)), location) as workers:
             for result in results(workers, tasks, Patience(), location):
                 finished += result
                 if progress is not None:
@@ -219,18 +219,18 @@ def simulate_many(
             raise
         interrupted = True
     finished.sort(key=lambda run: run.number)
-    changing = system.experiment.joins or system.experiment.leaves
-    mean_square = None if interrupted or changing else _mean_square(system)
-    return Ensemble(system.name, settings.duration, seed, tuple(finished), interrupted, mean_square)
+    changing = model.experiment.joins or model.experiment.leaves
+    mean_square = None if interrupted or changing else _mean_square(model)
+    return Ensemble(model.name, settings.duration, seed, tuple(finished), interrupted, mean_square)
 
 
-def _mean_square(system: Model) -> MeanSquare | None:
+def _mean_square(model: Model) -> MeanSquare | None:
     """Return the mean-square verdict of a model, None if no packet is lost or late."""
-    if not unreliable(system):
+    if not unreliable(model):
         return None
     try:
-        with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
-            numeric = numeric_model(system)
+        with single_threaded(), finite_equations(model.origin.topology), np.errstate(all="ignore"):
+            numeric = numeric_model(model)
             result = mean_square_growth(numeric)
     except ApcError as error:  # a model that can't be analysed can still be simulated
         return MeanSquare(None, None, None, False, error.mistakes[0].message)
@@ -242,14 +242,14 @@ def _mean_square(system: Model) -> MeanSquare | None:
 
 
 def _workers(
-    system: Model, settings: Settings, jobs: int, location: SourceLocation
+    model: Model, settings: Settings, jobs: int, location: SourceLocation
 ) -> AbstractContextManager[Workers[range, list[EnsembleRun]]]:
     """Return the workers that simulate runs: this process, or separate processes."""
     if jobs == 1:
-        return nullcontext(this_process(_runs, prepare(system, settings)))
+        return nullcontext(this_process(_runs, prepare(model, settings)))
     message = "a simulating process exited unexpectedly: stopped, or out of memory"
     loss_error = Diagnostic("E895", location, message, fix="--jobs 1")
-    return local_processes(_runs_of_model, (model_bytes(system), settings), jobs, loss_error)
+    return local_processes(_runs_of_model, (model_bytes(model), settings), jobs, loss_error)
 
 
 def _runs_of_model(shared: tuple[bytes, Settings], numbers: range) -> list[EnsembleRun]:

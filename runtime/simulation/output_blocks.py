@@ -97,7 +97,7 @@ def blocks(
 
 def unsolved(simulation: Simulation, frame: int) -> ApcError:
     """Return the error E871 or E872 of a frame that could not be simulated."""
-    location = SourceLocation(simulation.system.origin.topology)
+    location = SourceLocation(simulation.model.origin.topology)
     at = f"after {float(frame * simulation.frame * simulation.quantum):g} s"
     if not simulation.tolerances:
         message = f"an equation has no solution, or Newton's method finds none, {at}"

@@ -90,11 +90,11 @@ def _rows(symbols: Any, indices: Sequence[int]) -> Any:
     return casadi.vertcat(*(symbols[index] for index in indices)) if indices else casadi.SX(0, 1)
 
 
-def count_pairs(system: Model, exchange: CommunicationGraph) -> int:
+def count_pairs(model: Model, exchange: CommunicationGraph) -> int:
     """Return the number of pairwise evaluations at one tick, summed over all links."""
     links = {
         receive.link
-        for peer_type in system.peer_types
+        for peer_type in model.peer_types
         for partition in peer_type.clocks
         for receive in partition.receives
         if edge_name(partition, receive)

@@ -171,10 +171,10 @@ def instants_within(schedules: Sequence[Schedule]) -> tuple[int, ...]:
     return tuple(sorted(instants))
 
 
-def refuse_unheard_of(system: Model) -> None:
+def refuse_unheard_of(model: Model) -> None:
     """Raise E893 if a link replaces lost packets by zero and a receiving peer has no own value to send."""
-    zero = {link.name for link in system.links for channel in link.channels if channel.on_loss == "zero"}
-    for peer_type in system.peer_types:
+    zero = {link.name for link in model.links for channel in link.channels if channel.on_loss == "zero"}
+    for peer_type in model.peer_types:
         for partition in peer_type.clocks:
             for receive in partition.receives:
                 if receive.link in zero and not any(send.link == receive.link for send in peer_type.sends):
@@ -184,7 +184,7 @@ def refuse_unheard_of(system: Model) -> None:
                     )
                     raise ApcError(
                         Diagnostic(
-                            "E893", SourceLocation(system.origin.topology), message, fix="on_loss: hold"
+                            "E893", SourceLocation(model.origin.topology), message, fix="on_loss: hold"
                         )
                     )
                 if receive.link in zero and receive.before:
@@ -193,7 +193,7 @@ def refuse_unheard_of(system: Model) -> None:
                     )
                     raise ApcError(
                         Diagnostic(
-                            "E893", SourceLocation(system.origin.topology), message, fix="on_loss: hold"
+                            "E893", SourceLocation(model.origin.topology), message, fix="on_loss: hold"
                         )
                     )
 

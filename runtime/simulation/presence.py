@@ -48,15 +48,15 @@ class Presence:
         return (self.joins[peers] <= instants[:, None]) & (instants[:, None] < self.leaves[peers])
 
 
-def first_peers(system: Model) -> dict[str, int]:
+def first_peers(model: Model) -> dict[str, int]:
     """Return the index of the first peer of each group."""
-    starts = np.cumsum([0, *(group.count for group in system.groups)]).tolist()
-    return {group.name: start for group, start in zip(system.groups, starts, strict=False)}
+    starts = np.cumsum([0, *(group.count for group in model.groups)]).tolist()
+    return {group.name: start for group, start in zip(model.groups, starts, strict=False)}
 
 
-def always_present(system: Model) -> Model:
+def always_present(model: Model) -> Model:
     """Return a model without joins and leaves: all its peers are always present."""
-    return replace(system, experiment=replace(system.experiment, joins=(), leaves=()))
+    return replace(model, experiment=replace(model.experiment, joins=(), leaves=()))
 
 
 def stored_names(peer_type: PeerType) -> list[str]:
@@ -68,17 +68,17 @@ def stored_names(peer_type: PeerType) -> list[str]:
     return names
 
 
-def location_of(system: Model, key: str, item: PeerTime) -> SourceLocation:
+def location_of(model: Model, key: str, item: PeerTime) -> SourceLocation:
     """Return the location of a join or leave (`key`): in the topology, or the option."""
     if item.line:
-        return SourceLocation(system.origin.topology, item.line, item.column)
+        return SourceLocation(model.origin.topology, item.line, item.column)
     return SourceLocation(f"--{key}")
 
 
-def refuse_joins_and_leaves(system: Model, command: str) -> None:
+def refuse_joins_and_leaves(model: Model, command: str) -> None:
     """Raise E914 if the experiment of a model has joins or leaves, which a command does not support."""
-    for key, items in (("joins", system.experiment.joins), ("leaves", system.experiment.leaves)):
+    for key, items in (("joins", model.experiment.joins), ("leaves", model.experiment.leaves)):
         if items:
-            location = location_of(system, key, items[0])
+            location = location_of(model, key, items[0])
             message = f"{key} are not available in {command}"
             raise ApcError(Diagnostic("E914", location, message, advice=f"remove {key}, or use apc simulate"))

@@ -135,12 +135,12 @@ def _tolerance(text: str, location: SourceLocation) -> float:
     return value
 
 
-def check_step(system: Model, method: Method, fastest: Fraction, longest: Fraction) -> None:
+def check_step(model: Model, method: Method, fastest: Fraction, longest: Fraction) -> None:
     """Raise E913 for a fixed step that is longer than the fastest clock's period, or far too short.
 
     Parameters
     ----------
-    system
+    model
         The model.
     method
         The method.
@@ -156,7 +156,7 @@ def check_step(system: Model, method: Method, fastest: Fraction, longest: Fracti
     """
     if method.step is None:
         return
-    location, message = SourceLocation(system.origin.topology), f"step of {method.name}"
+    location, message = SourceLocation(model.origin.topology), f"step of {method.name}"
     if method.step > fastest:
         expected = f"at most the period of the fastest clock, {_ms(fastest)}"
         fix = f"--method {method.name}:{no_more(1000 * fastest)}ms"

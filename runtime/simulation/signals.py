@@ -137,13 +137,13 @@ class SignalSelection:
 
 
 def choose(
-    system: Model, available: Sequence[Sequence[LocalSignal]], patterns: Sequence[str]
+    model: Model, available: Sequence[Sequence[LocalSignal]], patterns: Sequence[str]
 ) -> tuple[SignalSelection, ...]:
     """Return the signals of each group that match some pattern; without patterns, all signals.
 
     Parameters
     ----------
-    system
+    model
         The model.
     available
         The recordable signals of a peer of each group.
@@ -159,7 +159,7 @@ def choose(
     tests = [(pattern, _expression(pattern)) for pattern in patterns]
     used: set[str] = set()
     choices = []
-    for group, local_signals in zip(system.groups, available, strict=True):
+    for group, local_signals in zip(model.groups, available, strict=True):
         selected = np.full((group.count, len(local_signals)), not patterns)
         for pattern, test in tests:
             for index, local in enumerate(local_signals):
@@ -174,15 +174,15 @@ def choose(
         choices.append(SignalSelection(locals_, np.ascontiguousarray(selected[:, recorded])))
     for pattern in patterns:
         if pattern not in used:
-            _raise_no_match(system, available, pattern)
+            _raise_no_match(model, available, pattern)
     return tuple(choices)
 
 
-def signals_of(system: Model, choices: Sequence[SignalSelection]) -> tuple[Signal, ...]:
+def signals_of(model: Model, choices: Sequence[SignalSelection]) -> tuple[Signal, ...]:
     """Return the selected signals of all peers, in the order of the model."""
     return tuple(
         Signal(group.name, peer + 1, local.name, local.unit, local.role)
-        for group, choice in zip(system.groups, choices, strict=True)
+        for group, choice in zip(model.groups, choices, strict=True)
         for peer in range(group.count)
         for index, local in enumerate(choice.locals)
         if choice.selected[peer, index]
@@ -194,17 +194,15 @@ def _expression(pattern: str) -> re.Pattern[str]:
     return re.compile(re.escape(pattern.strip()).replace(r"\*", ".*").replace(r"\?", "."))
 
 
-def _raise_no_match(system: Model, available: Sequence[Sequence[LocalSignal]], pattern: str) -> None:
+def _raise_no_match(model: Model, available: Sequence[Sequence[LocalSignal]], pattern: str) -> None:
     """Raise the error E873 for a pattern without a match, with the nearest name."""
     names = dict.fromkeys(local.name for local_signals in available for local in local_signals)
     names |= dict.fromkeys(
         f"{group.name}[1].{local.name}"
-        for group, local_signals in zip(system.groups, available, strict=True)
+        for group, local_signals in zip(model.groups, available, strict=True)
         for local in local_signals
     )
     message = f"no signal matches {pattern[:80]!r}; the signals of a peer are {', '.join(list(names)[:12])}"
     near = nearest(pattern, names)
     fix, advice = (f"--signals {near}", "") if near else ("", f"use names such as {EXAMPLE}")
-    raise ApcError(
-        Diagnostic("E873", SourceLocation(system.origin.topology), message, fix=fix, advice=advice)
-    )
+    raise ApcError(Diagnostic("E873", SourceLocation(model.origin.topology), message, fix=fix, advice=advice))

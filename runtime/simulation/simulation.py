@@ -99,7 +99,7 @@ class Simulation:
     the instants at which peers join and leave, None if all peers are always present.
     """
 
-    system: Model
+    model: Model
     topology: Model
     settings: Settings
     population: Population
@@ -149,7 +149,7 @@ class Simulation:
 
 @part("prepare")
 def prepare(
-    system: Model,
+    model: Model,
     settings: Settings,
     *,
     signals: Sequence[str] = (),
@@ -159,7 +159,7 @@ def prepare(
 
     Parameters
     ----------
-    system
+    model
         The model.
     settings
         The simulation settings.
@@ -176,65 +176,65 @@ def prepare(
         delay is a range, E913 a step that does not fit, E914 an invalid join or leave; and the errors of
         `build_schedules`, `build_population` and `routes_of`.
     """
-    topology = system
-    refuse_unheard_of(system)
-    refuse_range(system)
-    with finite_equations(system.origin.topology):
-        plan = plan_of(system, settings.method)
-        system = plan.system
+    topology = model
+    refuse_unheard_of(model)
+    refuse_range(model)
+    with finite_equations(model.origin.topology):
+        plan = plan_of(model, settings.method)
+        model = plan.model
         choices = _choices(plan, signals)
         members = _members(plan, choices, settings.method, live=live)
         population = build_population(plan.exchange, members, plan.routes)
-    schedule, recorded = plan.schedules[0], signals_of(system, choices)
+    schedule, recorded = plan.schedules[0], signals_of(model, choices)
     presence: Presence | None = None
-    if system.experiment.joins or system.experiment.leaves:
+    if model.experiment.joins or model.experiment.leaves:
         extension = require_extension("changing_counts")
-        presence = extension.presence_of(system, schedule, settings.duration)
+        presence = extension.presence_of(model, schedule, settings.duration)
     sample_times = schedule.sample_times[:-1]
     timings, quantum = plan.numbers.timings, schedule.quantum
     return Simulation(
-        system=system,
+        model=model,
         topology=topology,
         settings=settings,
         population=population,
         signals=recorded,
-        order=_order(system, population, recorded),
+        order=_order(model, population, recorded),
         forces=tuple(_forces(member) for member in members),
         arrival_processes=tuple(
-            arrival_process_of(system, timings, plan.exchange, route, quantum) for route in plan.routes
+            arrival_process_of(model, timings, plan.exchange, route, quantum) for route in plan.routes
         ),
-        seed=system.experiment.seed if settings.seed is None else settings.seed,
-        tolerances=_tolerances(system, plan.flows),
+        seed=model.experiment.seed if settings.seed is None else settings.seed,
+        tolerances=_tolerances(model, plan.flows),
         sent=tuple(
             dict.fromkeys(
-                peer_type.states[i].name for peer_type in system.peer_types for i in sent_states(peer_type)
+                peer_type.states[i].name for peer_type in model.peer_types for i in sent_states(peer_type)
             )
         ),
         quantum=quantum,
         frame=schedule.frame,
         sample_times=sample_times,
-        ticks_at_zero=_ticks_at_zero(system, plan.numbers),
+        ticks_at_zero=_ticks_at_zero(model, plan.numbers),
         library=library_of(population) if settings.jit else None,
         length=_chunk_length(population, settings.duration),
         presence=presence,
     )
 
 
-def check_joins_and_leaves(system: Model) -> None:
+def check_joins_and_leaves(model: Model) -> None:
     """Raise E914 for an invalid join or leave in the experiment of a model, E882 without the extension."""
-    experiment = system.experiment
+    experiment = model.experiment
     if items := (*experiment.joins, *experiment.leaves):
         duration = experiment.duration or 1 + max(item.at for item in items)
-        schedule = plan_of(system, DEFAULT).schedules[0]
-        require_extension("changing_counts").presence_of(system, schedule, duration)
+        schedule = plan_of(model, DEFAULT).schedules[0]
+        require_extension("changing_counts").presence_of(model, schedule, duration)
 
 
-def check_length(system: Model, duration: Fraction, *, runs: int = 1) -> None:
+def check_length(model: Model, duration: Fraction, *, runs: int = 1) -> None:
     """Raise E915 for a duration that would take too long to simulate.
 
     Parameters
     ----------
-    system
+    model
         The model.
     duration
         The duration in seconds.
@@ -246,15 +246,15 @@ def check_length(system: Model, duration: Fraction, *, runs: int = 1) -> None:
     ApcError
         E915 more than `MOST_ROWS` rows.
     """
-    timings = {timing.name: timing.value for timing in system.timings}
-    row = min((timings[clock.period] for clock in system.clocks), default=ROW)
+    timings = {timing.name: timing.value for timing in model.timings}
+    row = min((timings[clock.period] for clock in model.clocks), default=ROW)
     if duration * runs <= MOST_ROWS * row:
         return
     longest = float(MOST_ROWS * row / runs)
     each = f" in each of {runs:,} runs" if runs > 1 else ""
     expected = f"at most {longest:.6g} s{each} ({MOST_ROWS:,} rows, one for each tick)"
     got, fix = f"{float(duration):.6g} s", f'--duration "{no_more(longest)} s"'
-    raise ApcError(Diagnostic("E915", SourceLocation(system.origin.topology), "duration", expected, got, fix))
+    raise ApcError(Diagnostic("E915", SourceLocation(model.origin.topology), "duration", expected, got, fix))
 
 
 def size_note(simulation: Simulation, *, decimal: bool) -> str:
@@ -283,10 +283,10 @@ class SimulationPlan:
 
     `subsystems` are the Jacobians of each peer type, `flows` the equations of each peer type that the method
     integrates, `schedules` the events of each group's frame; `routes` are the receptions over unreliable
-    links. `system` is stamped: if ages are recorded, packets contain their time of sending.
+    links. `model` is stamped: if ages are recorded, packets contain their time of sending.
     """
 
-    system: Model
+    model: Model
     numbers: ResolvedNumbers
     exchange: CommunicationGraph
     subsystems: tuple[SubsystemJacobians, ...]
@@ -295,40 +295,40 @@ class SimulationPlan:
     schedules: tuple[Schedule, ...]
 
 
-def plan_of(system: Model, method: Method) -> SimulationPlan:
+def plan_of(model: Model, method: Method) -> SimulationPlan:
     """Return the simulation plan of a model: its numbers, flows, routes and schedules.
 
     Raises ApcError for a model that cannot be simulated.
     """
-    system = stamped(system)
-    numbers = resolve(system)
-    subsystems = tuple(jacobians(peer_type) for peer_type in system.peer_types)
+    model = stamped(model)
+    numbers = resolve(model)
+    subsystems = tuple(jacobians(peer_type) for peer_type in model.peer_types)
     flows = tuple(
-        _flow(system, numbers, index, subsystem, method) for index, subsystem in enumerate(subsystems)
+        _flow(model, numbers, index, subsystem, method) for index, subsystem in enumerate(subsystems)
     )
-    exchange = build_exchange(system, numbers.timings)
+    exchange = build_exchange(model, numbers.timings)
     patterns = [subsystem.pattern for subsystem in subsystems]
-    schedules = build_schedules(system, numbers.timings, patterns)
-    routes = routes_of(system, numbers.timings, exchange, schedules[0].frame_s)
+    schedules = build_schedules(model, numbers.timings, patterns)
+    routes = routes_of(model, numbers.timings, exchange, schedules[0].frame_s)
     if routes:
         stored = {route.link: route.frames for route in routes}
-        schedules = build_schedules(system, numbers.timings, patterns, stored=stored)
-    if not system.clocks:  # then there is one interval, of any length
+        schedules = build_schedules(model, numbers.timings, patterns, stored=stored)
+    if not model.clocks:  # then there is one interval, of any length
         schedules = tuple(replace(schedule, quantum=ROW / schedule.frame) for schedule in schedules)
-    _check_size(system, exchange, schedules)
-    _check_step(system, numbers, schedules, method)
-    return SimulationPlan(system, numbers, exchange, subsystems, flows, routes, schedules)
+    _check_size(model, exchange, schedules)
+    _check_step(model, numbers, schedules, method)
+    return SimulationPlan(model, numbers, exchange, subsystems, flows, routes, schedules)
 
 
 def _choices(plan: SimulationPlan, signals: Sequence[str]) -> tuple[SignalSelection, ...]:
     """Return the recorded signals of each group; raise an error if they exceed the memory."""
-    system = plan.system
+    model = plan.model
     available = [
-        local_signals(system.peer_types[group.peer_type], schedule)
-        for group, schedule in zip(system.groups, plan.schedules, strict=True)
+        local_signals(model.peer_types[group.peer_type], schedule)
+        for group, schedule in zip(model.groups, plan.schedules, strict=True)
     ]
-    choices = choose(system, available, signals)
-    _check_size(system, plan.exchange, plan.schedules, choices)
+    choices = choose(model, available, signals)
+    _check_size(model, plan.exchange, plan.schedules, choices)
     return choices
 
 
@@ -336,15 +336,15 @@ def _members(
     plan: SimulationPlan, choices: Sequence[SignalSelection], method: Method, *, live: bool
 ) -> list[GroupProgram]:
     """Return the members of the population: the recorded peers of each group, then its other peers."""
-    system, numbers, flows = plan.system, plan.numbers, plan.flows
+    model, numbers, flows = plan.model, plan.numbers, plan.flows
     linear = [
         rates(peer_type, flow.rows if flow else ())
-        for peer_type, flow in zip(system.peer_types, flows, strict=True)
+        for peer_type, flow in zip(model.peer_types, flows, strict=True)
     ]
     segment_ends = instants_within(plan.schedules) if live else exchanges_within(plan.schedules)
     programs: dict[Any, Program] = {}
     members = []
-    groups = zip(system.groups, plan.schedules, choices, strict=True)
+    groups = zip(model.groups, plan.schedules, choices, strict=True)
     for group, (model_group, schedule, choice) in enumerate(groups):
         rows, parameter_vectors = numbers.rows[group], numbers.parameters[group]
         transitions: Sequence[Floats] | None = None
@@ -397,11 +397,11 @@ def _chunk_length(population: Population, duration: Fraction) -> int:
     return -(-frames // -(-frames // longest))
 
 
-def _order(system: Model, population: Population, signals: Sequence[Signal]) -> Integers:
+def _order(model: Model, population: Population, signals: Sequence[Signal]) -> Integers:
     """Return the index of each signal in a row of the population."""
-    starts = np.cumsum([0] + [group.count for group in system.groups])
+    starts = np.cumsum([0] + [group.count for group in model.groups])
     column_of = {
-        (system.groups[member.group].name, peer, local.name): column + index * member.count + i
+        (model.groups[member.group].name, peer, local.name): column + index * member.count + i
         for member, column in zip(population.members, population.columns, strict=True)
         for index, local in enumerate(member.program.recorded)
         for i, peer in enumerate((member.peers - starts[member.group] + 1).tolist())
@@ -409,10 +409,10 @@ def _order(system: Model, population: Population, signals: Sequence[Signal]) -> 
     return np.array([column_of[signal.group, signal.peer, signal.local] for signal in signals], np.int64)
 
 
-def _ticks_at_zero(system: Model, numbers: ResolvedNumbers) -> bool:
+def _ticks_at_zero(model: Model, numbers: ResolvedNumbers) -> bool:
     """Return whether the fastest clock ticks at time 0."""
-    used = clocks_in_use(system)
-    clocks = [clock for clock in system.clocks if clock.name in used]
+    used = clocks_in_use(model)
+    clocks = [clock for clock in model.clocks if clock.name in used]
     if not clocks:
         return True
     fastest = min(clocks, key=lambda clock: numbers.timings[clock.period])
@@ -420,7 +420,7 @@ def _ticks_at_zero(system: Model, numbers: ResolvedNumbers) -> bool:
 
 
 def _check_size(
-    system: Model,
+    model: Model,
     exchange: CommunicationGraph,
     schedules: Sequence[Schedule],
     choices: Sequence[SignalSelection] = (),
@@ -430,45 +430,45 @@ def _check_size(
         int(choice.selected.any(axis=1).sum()) * len(choice.locals) * len(schedule.sample_times)
         for choice, schedule in zip(choices, schedules, strict=bool(choices))
     )
-    for group, schedule in zip(system.groups, schedules, strict=True):
-        peer_type = system.peer_types[group.peer_type]
+    for group, schedule in zip(model.groups, schedules, strict=True):
+        peer_type = model.peer_types[group.peer_type]
         interval_lengths = 2  # most schedules have two, each with its own transition matrix
         numbers_per_peer = len(peer_type.parameters) + interval_lengths * len(peer_type.states) * (
             len(peer_type.states) + len(peer_type.holds) + 1
         )
         total += group.count * (numbers_per_peer + sum(schedule.depths))
-    total += NUMBERS_A_PAIR * count_pairs(system, exchange)
-    message = f"{system.peers:,} peers with {total:,} numbers in a frame"
+    total += NUMBERS_A_PAIR * count_pairs(model, exchange)
+    message = f"{model.peers:,} peers with {total:,} numbers in a frame"
     refuse_beyond(
         NUMBER * total,
         "E874",
-        SourceLocation(system.origin.topology),
+        SourceLocation(model.origin.topology),
         message,
         "use fewer peers or fewer --signals",
     )
 
 
 def _flow(
-    system: Model, numbers: ResolvedNumbers, index: int, subsystem: SubsystemJacobians, method: Method
+    model: Model, numbers: ResolvedNumbers, index: int, subsystem: SubsystemJacobians, method: Method
 ) -> Flow | None:
     """Return the equations of a peer type that the method integrates, None if it integrates no state."""
-    peer_type = system.peer_types[index]
+    peer_type = model.peer_types[index]
     rows = rows_to_move(peer_type, method)
     if not rows:
         return None
     parameter_vectors = [
         vector
-        for group, vectors_of_group in zip(system.groups, numbers.parameters, strict=True)
+        for group, vectors_of_group in zip(model.groups, numbers.parameters, strict=True)
         if group.peer_type == index
         for vector in vectors_of_group
     ]
-    return flow_of(peer_type, method, rows, state_scales(system, peer_type, subsystem, parameter_vectors))
+    return flow_of(peer_type, method, rows, state_scales(model, peer_type, subsystem, parameter_vectors))
 
 
-def _tolerances(system: Model, flows: Sequence[Flow | None]) -> tuple[Tolerance, ...]:
+def _tolerances(model: Model, flows: Sequence[Flow | None]) -> tuple[Tolerance, ...]:
     """Return the tolerances of all integrated states; a state of several peer types has the smallest."""
     result: dict[str, Tolerance] = {}
-    for peer_type, flow in zip(system.peer_types, flows, strict=True):
+    for peer_type, flow in zip(model.peer_types, flows, strict=True):
         for tolerance in flow.tolerances(peer_type) if flow else ():
             if tolerance.state not in result or tolerance.absolute < result[tolerance.state].absolute:
                 result[tolerance.state] = tolerance
@@ -476,17 +476,17 @@ def _tolerances(system: Model, flows: Sequence[Flow | None]) -> tuple[Tolerance,
 
 
 def _check_step(
-    system: Model, numbers: ResolvedNumbers, schedules: Sequence[Schedule], method: Method
+    model: Model, numbers: ResolvedNumbers, schedules: Sequence[Schedule], method: Method
 ) -> None:
     """Raise an error for a fixed step that is longer than the fastest clock's period, or far too short."""
-    fastest = min((numbers.timings[clock.period] for clock in system.clocks), default=ROW)
+    fastest = min((numbers.timings[clock.period] for clock in model.clocks), default=ROW)
     lengths = [
         event.duration * schedule.quantum
         for schedule in schedules
         for event in schedule.events
         if isinstance(event, Propagate)
     ]
-    check_step(system, method, fastest, max(lengths, default=fastest))
+    check_step(model, method, fastest, max(lengths, default=fastest))
 
 
 def _forces(member: GroupProgram) -> tuple[SubsystemForcing, ...]:

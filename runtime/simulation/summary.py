@@ -165,7 +165,7 @@ class SummaryAccumulator:
         self.forces = [
             i for i, signal in enumerate(self.signals) if signal.unit == "N" and signal.role != "limited"
         ]
-        self.limits = _limits(simulation.system, self.signals)
+        self.limits = _limits(simulation.model, self.signals)
         self.width = -(-simulation.rows // max(FEWEST_GROUPS, MOST_EXTREMES // max(n, 1)))
         groups = -(-simulation.rows // self.width)
         self.low, self.high = np.full((groups, n), np.inf), np.full((groups, n), -np.inf)
@@ -260,7 +260,7 @@ class SummaryAccumulator:
             end=float(ends[-1]),
             extents=extents,
             broken=self._broken(),
-            unrecorded=_position_count(self.simulation.system) - sum(map(is_position, self.signals)),
+            unrecorded=_position_count(self.simulation.model) - sum(map(is_position, self.signals)),
         )
 
     def _verdict(
@@ -359,17 +359,17 @@ def _first_finite(values: Floats) -> Floats:
     return rows
 
 
-def _limits(system: Model, signals: Sequence[Signal]) -> list[tuple[int, str, float]]:
+def _limits(model: Model, signals: Sequence[Signal]) -> list[tuple[int, str, float]]:
     """Return the column, the name and the value of each signal's limit.
 
     Values may differ from peer to peer.
     """
-    groups = {group.name: group for group in system.groups}
-    common = {parameter.name: parameter.value for parameter in system.parameters}
+    groups = {group.name: group for group in model.groups}
+    common = {parameter.name: parameter.value for parameter in model.parameters}
     limits = {
         (group.name, limit.name): limit.limit
-        for group in system.groups
-        for limit in system.peer_types[group.peer_type].limits
+        for group in model.groups
+        for limit in model.peer_types[group.peer_type].limits
     }
     return [
         (column, name, _parameter_of_peer(groups[signal.group], signal.peer, name, common))
@@ -386,27 +386,27 @@ def _parameter_of_peer(group: Group, peer: int, name: str, common: dict[str, flo
     return next((value.value for value in group.values if value.name == name), common[name])
 
 
-def checked_by_analysis(summary: Summary, system: Model) -> Summary:
+def checked_by_analysis(summary: Summary, model: Model) -> Summary:
     """Return a summary whose verdict is "not determined" if it contradicts the analysis of a linear model.
 
     Parameters
     ----------
     summary
         The summary of a motion by exact transitions.
-    system
+    model
         The simulated model.
     """
     driven = summary.verdict is MotionVerdict.DRIVEN
     if (
         summary.verdict is MotionVerdict.AT_REST
         or (summary.driven_until and not driven)
-        or system.peers > MOST_LINEAR
+        or model.peers > MOST_LINEAR
     ):
         return summary
-    if not all(jacobians(peer_type).affine for peer_type in system.peer_types) or unreliable(system):
+    if not all(jacobians(peer_type).affine for peer_type in model.peer_types) or unreliable(model):
         return summary
     try:
-        analysis = analyze(numeric_model(system))
+        analysis = analyze(numeric_model(model))
     except ApcError:  # models that cannot be analyzed can be simulated
         return summary
     if driven:
@@ -444,10 +444,10 @@ def is_position(signal: Signal) -> bool:
     return signal.role == "state" and signal.unit in POSITIONS
 
 
-def _position_count(system: Model) -> int:
+def _position_count(model: Model) -> int:
     """Return the number of positions in a model, over all peers."""
-    per_type = [sum(state.unit in POSITIONS for state in peer_type.states) for peer_type in system.peer_types]
-    return sum(group.count * per_type[group.peer_type] for group in system.groups)
+    per_type = [sum(state.unit in POSITIONS for state in peer_type.states) for peer_type in model.peer_types]
+    return sum(group.count * per_type[group.peer_type] for group in model.groups)
 
 
 def _overshoot(extents: Sequence[SignalRange]) -> tuple[str, float] | None:

@@ -122,28 +122,28 @@ class Trajectory(SimulationReport):
 
 def provenance_of(simulation: Simulation) -> Provenance:
     """Return the provenance of a simulation's results."""
-    system = simulation.system
+    model = simulation.model
     return Provenance(
-        topology=system.name,
-        texts=texts_of(system),
+        topology=model.name,
+        texts=texts_of(model),
         duration_s=str(simulation.settings.duration),
         method=simulation.how,
         tolerances=simulation.tolerances,
         seed=simulation.seed,
-        parameters=parameters_of(system),
-        timings=tuple((timing.name, str(timing.value)) for timing in system.timings),
-        joins=system.experiment.joins,
-        leaves=system.experiment.leaves,
+        parameters=parameters_of(model),
+        timings=tuple((timing.name, str(timing.value)) for timing in model.timings),
+        joins=model.experiment.joins,
+        leaves=model.experiment.leaves,
     )
 
 
-def parameters_of(system: Model) -> tuple[tuple[str, float, str], ...]:
+def parameters_of(model: Model) -> tuple[tuple[str, float, str], ...]:
     """Return the parameters of a model, its groups and its peers: name, value in SI, unit."""
-    parameters = [(parameter.name, parameter.value, parameter.unit) for parameter in system.parameters]
-    for group in system.groups:
+    parameters = [(parameter.name, parameter.value, parameter.unit) for parameter in model.parameters]
+    for group in model.groups:
         parameters += [(f"{group.name}.{value.name}", value.value, value.unit) for value in group.values]
-    units = {parameter.name: parameter.unit for parameter in system.parameters}
-    for group in system.groups:
+    units = {parameter.name: parameter.unit for parameter in model.parameters}
+    for group in model.groups:
         for column in group.columns:
             parameters += [
                 (f"{group.name}[{i + 1}].{column.name}", float(value), units.get(column.name, "1"))
@@ -152,9 +152,9 @@ def parameters_of(system: Model) -> tuple[tuple[str, float, str], ...]:
     return tuple(parameters)
 
 
-def texts_of(system: Model) -> str:
+def texts_of(model: Model) -> str:
     """Return the SHA-256 of all texts of a model."""
-    texts = "\n".join(f"{name} {digest}" for name, digest in system.origin.digests)
+    texts = "\n".join(f"{name} {digest}" for name, digest in model.origin.digests)
     return hashlib.sha256(texts.encode("utf-8", "surrogateescape")).hexdigest()
 
 
@@ -173,7 +173,7 @@ class Keeper:
         message = f"{len(simulation.signals):,} signals over {float(simulation.settings.duration):g} s"
         advice = "use fewer --signals, a shorter --duration, or --out FILE.parquet alone"
         refuse_beyond(
-            NUMBER * numbers, "E876", SourceLocation(simulation.system.origin.topology), message, advice
+            NUMBER * numbers, "E876", SourceLocation(simulation.model.origin.topology), message, advice
         )
         self.signals = len(simulation.signals)
         self.time: list[Floats] = []
@@ -214,15 +214,15 @@ def run_simulation(
         interrupted = True
     summary = accumulator.summary(block)
     if simulation.settings.method.name in (EXACT, WHERE_NEEDED):
-        system = simulation.topology
+        model = simulation.topology
         if simulation.presence is not None:
-            system = require_extension("changing_counts").model_at_end(simulation)
-        summary = checked_by_analysis(summary, system)
+            model = require_extension("changing_counts").model_at_end(simulation)
+        summary = checked_by_analysis(summary, model)
     return summary, interrupted
 
 
 def simulate(
-    system: Model,
+    model: Model,
     *,
     duration: Fraction | None = None,
     signals: Sequence[str] = (),
@@ -235,7 +235,7 @@ def simulate(
 
     Parameters
     ----------
-    system
+    model
         The model.
     duration
         The duration in seconds; by default that of the model's experiment.
@@ -255,8 +255,8 @@ def simulate(
     ApcError
         E877 no duration is given, E876 too many numbers to store; and the errors of `simulation.prepare`.
     """
-    settings = Settings(duration_of(system, duration), method, seed, jit)
-    simulation = prepare(system, settings, signals=signals)
+    settings = Settings(duration_of(model, duration), method, seed, jit)
+    simulation = prepare(model, settings, signals=signals)
     keeper = Keeper(simulation)
     comparison = compare_with(simulation, signals=signals) if error else None
     summary, interrupted = run_simulation(simulation, [keeper, *([comparison] if comparison else [])])
@@ -285,7 +285,7 @@ def trajectory_of(
         The error estimate, if any.
     """
     return Trajectory(
-        topology=simulation.system.name,
+        topology=simulation.model.name,
         time=np.concatenate(keeper.time),
         values=np.concatenate(keeper.values),
         signals=simulation.signals,
@@ -301,12 +301,12 @@ def parse_duration(text: str) -> Fraction:
     return option_value("--duration", text, subject="duration", unit="s")
 
 
-def duration_of(system: Model, duration: Fraction | None, *, runs: int = 1) -> Fraction:
+def duration_of(model: Model, duration: Fraction | None, *, runs: int = 1) -> Fraction:
     """Return the simulated duration in seconds: the given duration, or that of the experiment.
 
     Parameters
     ----------
-    system
+    model
         The model.
     duration
         The duration in seconds, if given.
@@ -318,15 +318,15 @@ def duration_of(system: Model, duration: Fraction | None, *, runs: int = 1) -> F
     ApcError
         E877 no duration is given; E915 the run would take too long.
     """
-    number = system.experiment.duration if duration is None else duration
+    number = model.experiment.duration if duration is None else duration
     if number is None:
         message = "the topology has no duration"
         fix = 'experiment: {duration: 3 s}, or --duration "3 s"'
-        raise ApcError(Diagnostic("E877", SourceLocation(system.origin.topology), message, fix=fix))
+        raise ApcError(Diagnostic("E877", SourceLocation(model.origin.topology), message, fix=fix))
     if number <= 0:
         expected, got = "more than 0 s", f"{float(number):g} s"
         raise ApcError(
-            Diagnostic("E877", SourceLocation(system.origin.topology), "duration", expected=expected, got=got)
+            Diagnostic("E877", SourceLocation(model.origin.topology), "duration", expected=expected, got=got)
         )
-    check_length(system, number, runs=runs)
+    check_length(model, number, runs=runs)
     return number

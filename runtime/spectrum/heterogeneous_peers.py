@@ -78,15 +78,15 @@ def populations(numeric: NumericModel) -> tuple[HeterogeneousGroup, ...]:
     ApcError
         E804 more different peers than the memory can store.
     """
-    system, schedules, numbers = numeric.model, numeric.schedules, numeric.numbers
+    model, schedules, numbers = numeric.model, numeric.schedules, numeric.numbers
     if sum(map(len, numbers.rows)) > MOST_DIFFERENT:
         message = (
-            f"{system.peers:,} peers, some of which differ; the limit for different peers is "
+            f"{model.peers:,} peers, some of which differ; the limit for different peers is "
             f"{MOST_DIFFERENT:,}"
         )
         raise ApcError(
             Diagnostic(
-                "E804", SourceLocation(system.origin.topology), message, advice="reduce the number of peers"
+                "E804", SourceLocation(model.origin.topology), message, advice="reduce the number of peers"
             )
         )
     states = list(map(states_of, schedules, numeric.subsystems))
@@ -95,13 +95,13 @@ def populations(numeric: NumericModel) -> tuple[HeterogeneousGroup, ...]:
     refuse_beyond(
         needed,
         "E804",
-        SourceLocation(system.origin.topology),
+        SourceLocation(model.origin.topology),
         message,
         "reduce the number of different peers",
     )
     result = []
     for index, (subsystem, schedule) in enumerate(zip(numeric.subsystems, schedules, strict=True)):
-        group, parameters = system.groups[index], numbers.parameters[index]
+        group, parameters = model.groups[index], numbers.parameters[index]
         matrices = linearize_rows(subsystem, parameters)
         parts = [
             lift(subsystem_of(subsystem, matrices[start : start + CHUNK]), schedule)

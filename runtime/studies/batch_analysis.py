@@ -132,12 +132,12 @@ class _DependencyGroup:
 class _SharedMatrices:
     """The data shared by all points with the same times and numbers of peers.
 
-    `system` is the model with these, `evaluator` returns its matrices, `parts` are their strongly connected
+    `model` is the model with these, `evaluator` returns its matrices, `parts` are their strongly connected
     parts. `reaching` are the varied parameters with dependents. `rigid` and `drifts` are the numbers of rigid
     modes and of drifts. `resolved` are cached parameters, None for invalid values.
     """
 
-    system: Model
+    model: Model
     evaluator: BatchEvaluator
     columns: tuple[int, ...]  # the index of each free parameter among the varied ones
     reaching: tuple[_DependencyGroup, ...]
@@ -252,12 +252,12 @@ class Analyses(Result):
         return table
 
 
-def analyze_many(system: Model, values: Mapping[str, Any]) -> Analyses:
+def analyze_many(model: Model, values: Mapping[str, Any]) -> Analyses:
     """Return the analyses of a model at many values of some parameters and times.
 
     Parameters
     ----------
-    system
+    model
         The compiled model; its values hold for all other parameters.
     values
         The values of each parameter or time by its name: an array in SI, or quantities such as "8 ms". Arrays
@@ -274,12 +274,12 @@ def analyze_many(system: Model, values: Mapping[str, Any]) -> Analyses:
         raise ApcError(Diagnostic("E883", LOCATION, message, fix='{"contact.stiffness": [500.0, 1000.0]}'))
     parameter_refs, value_arrays = [], []
     for name, given in values.items():
-        parameter_ref = find(system, name.strip(), LOCATION, counts=True)
+        parameter_ref = find(model, name.strip(), LOCATION, counts=True)
         if parameter_ref in parameter_refs:
             raise ApcError(Diagnostic("E883", LOCATION, f"{parameter_ref.label} is given twice"))
-        refuse_channel_number(system, parameter_ref, LOCATION)
+        refuse_channel_number(model, parameter_ref, LOCATION)
         parameter_refs.append(parameter_ref)
-        value_arrays.append(_values_in_si(system, parameter_ref, given))
+        value_arrays.append(_values_in_si(model, parameter_ref, given))
     try:
         arrays = np.broadcast_arrays(*value_arrays)
     except ValueError:
@@ -291,11 +291,11 @@ def analyze_many(system: Model, values: Mapping[str, Any]) -> Analyses:
         numbers, index_of = np.unique(array.ravel(), return_inverse=True)
         varied.append(SweptParameter(parameter_ref, numbers, partial(_shortest, numbers)))
         indices.append(index_of)
-    rows = many_analyses(system, varied).at(np.stack(indices, axis=1))
+    rows = many_analyses(model, varied).at(np.stack(indices, axis=1))
     shape = arrays[0].shape
-    units = [unit_of(system, parameter_ref.name) for parameter_ref in parameter_refs]
+    units = [unit_of(model, parameter_ref.name) for parameter_ref in parameter_refs]
     return Analyses(
-        topology=system.name,
+        topology=model.name,
         parameters=tuple(
             parameter_ref.label if unit == "1" else f"{parameter_ref.label} [{unit}]"
             for parameter_ref, unit in zip(parameter_refs, units, strict=True)
@@ -303,16 +303,16 @@ def analyze_many(system: Model, values: Mapping[str, Any]) -> Analyses:
         values=tuple(arrays),
         **{field.name: getattr(rows, field.name).reshape(shape) for field in fields(rows)},
         limitations=(
-            *near_start(numeric_model(system)),
-            *limitations(system, varied=parameter_refs),
-            *notes_for_all_groups(system, parameter_refs),
+            *near_start(numeric_model(model)),
+            *limitations(model, varied=parameter_refs),
+            *notes_for_all_groups(model, parameter_refs),
         ),
     )
 
 
-def _values_in_si(system: Model, parameter_ref: ParameterRef, given: Any) -> Floats:
+def _values_in_si(model: Model, parameter_ref: ParameterRef, given: Any) -> Floats:
     """Return the values of a parameter in SI, from numbers in SI or texts of quantities."""
-    unit, message = unit_of(system, parameter_ref.name), f"values of {parameter_ref.label}"
+    unit, message = unit_of(model, parameter_ref.name), f"values of {parameter_ref.label}"
     array = np.asarray(given)
     if array.dtype.kind in "UO" and all(isinstance(item, str) for item in array.ravel().tolist()):
         # The language of quantities, which numbers never need.
@@ -334,18 +334,18 @@ def _shortest(numbers: Floats, index: int) -> Fraction:
     return Fraction(repr(float(numbers[index])))
 
 
-def by_matrices(system: Model) -> bool:
+def by_matrices(model: Model) -> bool:
     """Return whether the matrices of many points can be computed together, from the parameters alone."""
-    subsystems = linear_subsystems(system)
-    return all(subsystems[group.peer_type].parameters_suffice for group in system.groups)
+    subsystems = linear_subsystems(model)
+    return all(subsystems[group.peer_type].parameters_suffice for group in model.groups)
 
 
-def many_analyses(system: Model, varied: Sequence[SweptParameter]) -> ManyAnalyses:
+def many_analyses(model: Model, varied: Sequence[SweptParameter]) -> ManyAnalyses:
     """Return the prepared analyses of a model for any values of some of its parameters.
 
     Parameters
     ----------
-    system
+    model
         The compiled model; its values hold for parameters that do not vary.
     varied
         The parameters that vary.
@@ -353,9 +353,9 @@ def many_analyses(system: Model, varied: Sequence[SweptParameter]) -> ManyAnalys
     schedule_columns = tuple(
         column
         for column, parameter in enumerate(varied)
-        if kind_for_parameter(system, parameter.free) is not EvaluatorKind.MATRICES
+        if kind_for_parameter(model, parameter.free) is not EvaluatorKind.MATRICES
     )
-    return ManyAnalyses(numeric_model(system), tuple(varied), schedule_columns)
+    return ManyAnalyses(numeric_model(model), tuple(varied), schedule_columns)
 
 
 @lru_cache(maxsize=STORED_ON)
@@ -395,7 +395,7 @@ def _shared_matrices(
     )
     parts, patterns = parts_of(evaluator)
     return _SharedMatrices(
-        system=timed_system,
+        model=timed_system,
         evaluator=evaluator,
         columns=columns,
         reaching=_dependency_groups(timed_system, columns, parameter_refs),
@@ -410,10 +410,10 @@ def _shared_matrices(
 
 
 def _dependency_groups(
-    system: Model, columns: Sequence[int], parameter_refs: Sequence[ParameterRef]
+    model: Model, columns: Sequence[int], parameter_refs: Sequence[ParameterRef]
 ) -> tuple[_DependencyGroup, ...]:
     """Return the varied parameters with dependents, in groups with common dependents."""
-    scopes = [scope_of(system), *(scope_of(system, group.values) for group in system.groups)]
+    scopes = [scope_of(model), *(scope_of(model, group.values) for group in model.groups)]
     groups: list[_DependencyGroup] = []
     for column, item in zip(columns, parameter_refs, strict=True):
         dependents = [scope.follow({item.name: None}, lambda *_: None, lambda _: None) for scope in scopes]
@@ -538,7 +538,7 @@ def _parameter_vectors(
     def vectors(group: PeerClass) -> Floats:
         """Return the parameters of a class at the points (k, n_p), or (1, n_p) if they are constant."""
         index, peer = shared.evaluator.first_peer(group)
-        names, group_name = group.jacobians.peer_type.parameters, shared.system.groups[index].name
+        names, group_name = group.jacobians.peer_type.parameters, shared.model.groups[index].name
         vectors = group.parameters[None]
 
         def set_columns(changed_columns: list[int], values: Floats) -> None:
@@ -582,7 +582,7 @@ def _resolved_values(
         if len(shared.resolved) >= MOST_RESOLVED:
             shared.resolved.clear()
         try:
-            shared.resolved[overrides] = resolve(apply(shared.system, overrides))
+            shared.resolved[overrides] = resolve(apply(shared.model, overrides))
         except ApcError:
             shared.resolved[overrides] = None
     return shared.resolved[overrides]

@@ -61,7 +61,7 @@ EXACT_WORK = 100_000
 STRIPS = 32
 
 
-def period_segments(system: Model, axis: Range, location: SourceLocation) -> Iterator[DelaySegment]:
+def period_segments(model: Model, axis: Range, location: SourceLocation) -> Iterator[DelaySegment]:
     """Yield a segment for each of some periods of a range, with ends halfway to the neighbouring periods.
 
     Raises
@@ -70,10 +70,10 @@ def period_segments(system: Model, axis: Range, location: SourceLocation) -> Ite
         As for `periods_near`.
     """
     step = (axis.high - axis.low) / STRIPS
-    values = periods_near(system, axis.free, [axis.low + step * k for k in range(STRIPS + 1)], location)
+    values = periods_near(model, axis.free, [axis.low + step * k for k in range(STRIPS + 1)], location)
     middles = [(before + after) / 2 for before, after in itertools.pairwise(values)]
     for value, low, high in zip(values, [axis.low, *middles], [*middles, axis.high], strict=True):
-        yield DelaySegment(low, high, None, system_with_delay(system, axis.free, value))
+        yield DelaySegment(low, high, None, system_with_delay(model, axis.free, value))
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,23 +83,23 @@ class _AnyPeriodPath(AnalyzedPath):
     An end that is None is relative to the present value.
     """
 
-    system: Model
+    model: Model
     low: Fraction | None
     high: Fraction | None
     location: SourceLocation
 
     def smooth_segments(self) -> Iterator[SmoothSegment]:
         """Yield one segment if all clocks scale with the number, otherwise one for each period."""
-        now = delay_now(self.system, self.free)
+        now = delay_now(self.model, self.free)
         low = self.low or min(now, self.high or now) / PERIOD_SPAN
         high = self.high or max(now, low) * PERIOD_SPAN
         points = spread(float(low), float(high), float(now))
         sample_at = partial(pointwise, self.verdict_at)
-        if is_scaled(self.system, self.free):
+        if is_scaled(self.model, self.free):
             yield SmoothSegment(low, high, points, float(low), sample_at, self.verdict_at, slow=True)
             return
         targets = sorted({low, *map(Fraction, points[1:-1].tolist()), high})
-        for period in periods_near(self.system, self.free, targets, self.location):
+        for period in periods_near(self.model, self.free, targets, self.location):
             yield SmoothSegment(
                 period,
                 period,
@@ -119,11 +119,11 @@ class _AnyPeriodPath(AnalyzedPath):
     def change(self, before: SmoothSegment, after: SmoothSegment, *, stable_below: bool) -> Crossing:
         """Return the change between two periods, with a gap as small as the length of frames permits."""
         low, high = before.low, after.low
-        unit = base_value(self.system, self.free)
+        unit = base_value(self.model, self.free)
         verdicts = [self.verdict_at(low), self.verdict_at(high)]
         while True:
             third = (high - low) / 3
-            arguments = self.system, self.free, unit, low + third, high - third
+            arguments = self.model, self.free, unit, low + third, high - third
             value = long_period_between(*arguments) or period_between(*arguments)
             middle_verdict = None if value is None else self.verdict_at(value)
             if value is None or middle_verdict is None or middle_verdict.stable is None:
@@ -154,7 +154,7 @@ class PeriodPath(_AnyPeriodPath):
 
     def _verdict(self, value: Fraction) -> Verdict:
         """Return the verdict of the model with this value."""
-        return self.decide(system_with_delay(self.system, self.free, value))
+        return self.decide(system_with_delay(self.model, self.free, value))
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,9 +174,9 @@ class NominalPeriodPath(_AnyPeriodPath):
         A drift counts as stable: it exists on both sides of a crossing. Exact arithmetic is
         limited to `EXACT_WORK`.
         """
-        changed = system_with_delay(self.system, self.free, value)
+        changed = system_with_delay(self.model, self.free, value)
         try:
-            if reaches_start(self.system, self.free):  # the kinks at the start depend on the period
+            if reaches_start(self.model, self.free):  # the kinks at the start depend on the period
                 analysis, _ = analyze_worst_side(sides(self.numeric.at(changed)), exact_work=EXACT_WORK)
             else:
                 ordered = self.sides

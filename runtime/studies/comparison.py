@@ -158,26 +158,26 @@ def compare(
         E940, E941 and E622, as in `choice`; E898 an unknown criterion.
     """
     check_over(systems, over)
-    analyzed = {index: system for index, system in enumerate(systems) if index not in refused}
-    for system in analyzed.values():
-        criterion_of(system, criterion, SourceLocation("criterion"))
-    chosen = {index: choose(system, over) for index, system in analyzed.items()}
+    analyzed = {index: model for index, model in enumerate(systems) if index not in refused}
+    for model in analyzed.values():
+        criterion_of(model, criterion, SourceLocation("criterion"))
+    chosen = {index: choose(model, over) for index, model in analyzed.items()}
     schemes = []
-    for index, system in enumerate(systems):
+    for index, model in enumerate(systems):
         reason = refused.get(index, "")
         if not reason:
             try:
-                schemes.append(_scheme(system, chosen[index], criterion, at, progress))
+                schemes.append(_scheme(model, chosen[index], criterion, at, progress))
                 continue
             except ApcError as error:
                 reason = error.mistakes[0].reason
         no_results = (None,) * 8
-        schemes.append(Scheme(system.name, system.peers, *no_results, effort(system), (), reason))
+        schemes.append(Scheme(model.name, model.peers, *no_results, effort(model), (), reason))
     return SchemeComparison(tuple(schemes), _notes(schemes))
 
 
 def _scheme(
-    system: Model,
+    model: Model,
     axes: Mapping[str, SweepChoice],
     criterion: str | None,
     at: str,
@@ -203,44 +203,44 @@ def _scheme(
         if not names[axis]:
             return None
         command = f"apc critical {names[axis]}"
-        notify(f"{system.name}: {command}")
+        notify(f"{model.name}: {command}")
         return result_or_none(
-            axis, command, lambda: critical(system, names[axis], criterion=criterion, progress=progress)
+            axis, command, lambda: critical(model, names[axis], criterion=criterion, progress=progress)
         )
 
-    notify(f"{system.name}: apc analyze")
-    numeric = numeric_model(system)
+    notify(f"{model.name}: apc analyze")
+    numeric = numeric_model(model)
     network = mean_square_stability(numeric) if criterion not in (NOMINAL, PASSIVE) else None
     if network is not None and network.mean_square_radius is None:
         missing["verdict"] = "; ".join(network.notes)
     analysis = analyze(numeric)
     return Scheme(
-        topology=system.name,
-        peers=system.peers,
+        topology=model.name,
+        peers=model.peers,
         analysis=analysis,
         network=network,
         passive=_passive(numeric) if criterion == PASSIVE else None,
-        simulated=result_or_none("simulated", "apc simulate", lambda: _simulated(system, notify))
+        simulated=result_or_none("simulated", "apc simulate", lambda: _simulated(model, notify))
         if analysis.linearized
         else None,
         stiffness=crossing(STIFFNESS),
         delay=crossing(DELAY),
         loss=crossing(LOSS),
         transparency=result_or_none("transparency", "apc transparency", lambda: _transparency(numeric, at)),
-        effort=effort(system),
+        effort=effort(model),
         missing=tuple(missing.items()),
     )
 
 
-def _simulated(system: Model, notify: Progress) -> SimulationReport:
+def _simulated(model: Model, notify: Progress) -> SimulationReport:
     """Return the simulation of a model over the duration of its experiment."""
-    simulation = prepare_simulation(system, Settings(duration_of(system, None)))
-    notify(f"{system.name}: apc simulate")
+    simulation = prepare_simulation(model, Settings(duration_of(model, None)))
+    notify(f"{model.name}: apc simulate")
     summary, interrupted = run_simulation(simulation, [])
     if interrupted:
         raise KeyboardInterrupt
     return SimulationReport(
-        topology=system.name, summary=summary, provenance=provenance_of(simulation), interrupted=False
+        topology=model.name, summary=summary, provenance=provenance_of(simulation), interrupted=False
     )
 
 

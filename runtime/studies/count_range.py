@@ -28,7 +28,7 @@ MOST_STRIPS = 200
 
 
 def count_range(
-    system: Model,
+    model: Model,
     parameter_ref: ParameterRef,
     limits: Sequence[Fraction | None],
     present: float,
@@ -38,7 +38,7 @@ def count_range(
 
     Parameters
     ----------
-    system, parameter_ref
+    model, parameter_ref
         The compiled model, and a count of it or a number on which counts depend.
     limits
         The two given limits; None is the minimum of the model, or `SPAN` times the present count
@@ -54,16 +54,16 @@ def count_range(
         E842 the limits are not integers.
     """
     low, high = limits
-    of_group = any(parameter_ref.name == group_count(group.name) for group in system.groups)
-    other_peers = system.peers - int(present) if of_group else 0
-    least = max(_least_count(system, parameter_ref.name), least_peers(system.peer_types) - other_peers)
+    of_group = any(parameter_ref.name == group_count(group.name) for group in model.groups)
+    other_peers = model.peers - int(present) if of_group else 0
+    least = max(_least_count(model, parameter_ref.name), least_peers(model.peer_types) - other_peers)
     first = _integer_limit(low, least, location)
-    incomplete_graph = any(link.graph.shape != "complete" for link in system.links)
+    incomplete_graph = any(link.graph.shape != "complete" for link in model.links)
     span = PLACED_SPAN if incomplete_graph else SPAN  # there each peer has an index in the graph
     largest_allowed = min(
         (
             parameter.maximum
-            for parameter in system.parameters
+            for parameter in model.parameters
             if parameter.name == parameter_ref.name and parameter.maximum is not None
         ),
         default=math.inf,
@@ -73,19 +73,19 @@ def count_range(
     )
 
 
-def _least_count(system: Model, count: str) -> int:
+def _least_count(model: Model, count: str) -> int:
     """Return the smallest count of a group: two if a mean, maximum or minimum receives from it alone, else 1.
 
     `count` is the name of a parameter; that of no group has the limit 1.
     """
     reduced = {
         receive.link
-        for peer_type in system.peer_types
+        for peer_type in model.peer_types
         for partition in peer_type.clocks
         for receive in partition.receives
         if receive.operator != "sum"
     }
-    for link in system.links:
+    for link in model.links:
         senders: dict[str, set[str]] = {}
         for sender, receiver, _ in link.graph.groups if link.name in reduced else ():
             senders.setdefault(group_count(receiver), set()).add(group_count(sender))
@@ -111,7 +111,7 @@ def whole_range(label: str, low: Fraction, high: Fraction) -> str:
     return f"{label}={first}:{last}" if first < last else ""
 
 
-def count_segments(system: Model, axis: Range, location: SourceLocation) -> Iterator[DelaySegment]:
+def count_segments(model: Model, axis: Range, location: SourceLocation) -> Iterator[DelaySegment]:
     """Yield a segment for each count of a range, with ends halfway to the neighbouring counts.
 
     Raises
@@ -130,5 +130,5 @@ def count_segments(system: Model, axis: Range, location: SourceLocation) -> Iter
         raise ApcError(Diagnostic("E881", location, axis.free.label, expected, got, fix))
     half = Fraction(1, 2)
     for count in range(int(axis.low), int(axis.high) + 1):
-        inside = apply(system, [Override(axis.free, Fraction(count))])
+        inside = apply(model, [Override(axis.free, Fraction(count))])
         yield DelaySegment(max(axis.low, count - half), min(axis.high, count + half), None, inside)

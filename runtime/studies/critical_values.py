@@ -139,7 +139,7 @@ class Critical(Result):
     no effect. `undecided` and `isolated` are those of `crossing.CrossingReport`. `counted` states that the
     parameter is a number of peers: the value of a crossing is then the number on its stable side.
     `limitations` are the limitations of the result. `groups` are the groups' present values (None if the
-    values of a group differ) of a parameter that is set for all groups although they differ. `system` is the
+    values of a group differ) of a parameter that is set for all groups although they differ. `model` is the
     model.
     """
 
@@ -160,7 +160,7 @@ class Critical(Result):
     evaluations: int
     has_effect: bool
     verdict: ConstantVerdict | None
-    system: Model = field(compare=False, repr=False)
+    model: Model = field(compare=False, repr=False)
     limitations: tuple[str, ...] = ()
     criterion: str = NOMINAL
     groups: tuple[tuple[str, float | None], ...] = ()
@@ -184,7 +184,7 @@ class Critical(Result):
 
 @part("critical")
 def critical(
-    system: Model,
+    model: Model,
     name: str,
     *,
     lower: str | Fraction | None = None,
@@ -196,7 +196,7 @@ def critical(
 
     Parameters
     ----------
-    system
+    model
         The compiled model; all other parameters keep its values.
     name
         The parameter or delay, of one group or of all (see `parameter_names.find`).
@@ -218,18 +218,18 @@ def critical(
         parameter's bounds, E844 a phase, or periods whose frames are all too long, E845 a delay of a
         nonlinear model, E896 a number of an unreliable link; and the errors of `units.quantity`.
     """
-    parameter_ref = find(system, name.strip(), _LOCATION, counts=True)
-    chosen_criterion = criterion_of(system, criterion, _LOCATION, [parameter_ref])
+    parameter_ref = find(model, name.strip(), _LOCATION, counts=True)
+    chosen_criterion = criterion_of(model, criterion, _LOCATION, [parameter_ref])
     by_growth = chosen_criterion in SCALAR_CRITERIA
     if not by_growth:
-        refuse_channel_number(system, parameter_ref, _LOCATION, instead=f"--criterion {MEAN_SQUARE}")
-    with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
-        timed = reaches_time(system, parameter_ref)
-        unit = unit_of(system, parameter_ref.name)
-        current = value_now(system, parameter_ref)
+        refuse_channel_number(model, parameter_ref, _LOCATION, instead=f"--criterion {MEAN_SQUARE}")
+    with single_threaded(), finite_equations(model.origin.topology), np.errstate(all="ignore"):
+        timed = reaches_time(model, parameter_ref)
+        unit = unit_of(model, parameter_ref.name)
+        current = value_now(model, parameter_ref)
         limits = [_limit(*pair, parameter_ref, unit) for pair in (("--lower", lower), ("--upper", upper))]
-        _check_limits(system, parameter_ref, limits, timed=timed)
-        numeric = numeric_model(system)
+        _check_limits(model, parameter_ref, limits, timed=timed)
+        numeric = numeric_model(model)
 
         def stable_of(changed: Model) -> bool | None:
             """Return whether a model is stable by the criterion, None if undecided."""
@@ -241,7 +241,7 @@ def critical(
 
         def stable_now() -> bool | None:
             """Return whether the model is stable with the present value."""
-            return stable_of(system)
+            return stable_of(model)
 
         relevant = _relevant_crossing(result, current, stable_now)
         start_limitations = near_start(numeric)
@@ -251,7 +251,7 @@ def critical(
             else _constant_verdict(result, current, stable_now, chosen_criterion, start_limitations)
         )
     return Critical(
-        topology=system.name,
+        topology=model.name,
         parameter=parameter_ref.label,
         unit=unit,
         current=current,
@@ -265,15 +265,15 @@ def critical(
         evaluations=result.evaluations,
         has_effect=result.has_effect,
         verdict=verdict,
-        system=system,
+        model=model,
         limitations=(
             *start_limitations,
-            *limitations(system, network=chosen_criterion != MEAN_SQUARE, varied=[parameter_ref]),
-            *(replaced_hands(system) if chosen_criterion == PASSIVE else ()),
+            *limitations(model, network=chosen_criterion != MEAN_SQUARE, varied=[parameter_ref]),
+            *(replaced_hands(model) if chosen_criterion == PASSIVE else ()),
         ),
         criterion=chosen_criterion,
-        groups=values_by_group(system, parameter_ref),
-        counted=reaches_count(system, parameter_ref),
+        groups=values_by_group(model, parameter_ref),
+        counted=reaches_count(model, parameter_ref),
         undecided=result.undecided,
         isolated=result.isolated,
     )
@@ -302,7 +302,7 @@ def _search_by_criterion(
     progress
         The receiver of progress texts.
     """
-    system = numeric.model
+    model = numeric.model
     choice = evaluator_for(numeric, [parameter_ref], criterion)
     low, high = (None if limit is None else float(limit) for limit in limits)
     ends = low, high
@@ -310,11 +310,11 @@ def _search_by_criterion(
     reported = progress
 
     if choice.kind is EvaluatorKind.COUNTS:
-        counts = count_range(system, parameter_ref, limits, value_now(system, parameter_ref), _LOCATION)
-        paths = [PeerCountPath(parameter_ref, system, stable_of, *counts)]
+        counts = count_range(model, parameter_ref, limits, value_now(model, parameter_ref), _LOCATION)
+        paths = [PeerCountPath(parameter_ref, model, stable_of, *counts)]
     elif choice.kind is EvaluatorKind.PERIODS:
-        if criterion == MEAN_SQUARE and not is_scaled(system, parameter_ref):
-            refuse_timing_parameter(system, parameter_ref, _LOCATION, criterion)
+        if criterion == MEAN_SQUARE and not is_scaled(model, parameter_ref):
+            refuse_timing_parameter(model, parameter_ref, _LOCATION, criterion)
 
         def decide(changed: Model) -> Verdict:
             """Return the verdict of a model by a scalar criterion.
@@ -325,26 +325,26 @@ def _search_by_criterion(
                 return verdict_with(numeric.at(changed), [], _LOCATION, criterion=criterion)
             except ApcError as error:
                 # A frame may be too long, or overflow; an error at every value is raised.
-                if changed is system or error.mistakes[0].code not in (*NOWHERE, *TOO_LONG):
+                if changed is model or error.mistakes[0].code not in (*NOWHERE, *TOO_LONG):
                     raise
                 return OPEN
 
-        arguments = parameter_ref, system, limits[0], limits[1], _LOCATION
+        arguments = parameter_ref, model, limits[0], limits[1], _LOCATION
         if criterion in SCALAR_CRITERIA:
-            decide(system)
+            decide(model)
             paths = [PeriodPath(*arguments, decide)]
         else:
             paths = [NominalPeriodPath(*arguments, numeric)]
     elif criterion in SCALAR_CRITERIA:
-        refuse_timing_parameter(system, parameter_ref, _LOCATION, criterion)
+        refuse_timing_parameter(model, parameter_ref, _LOCATION, criterion)
         paths = [_pointwise_path(numeric, parameter_ref, ends, criterion)]
     elif choice.kind is EvaluatorKind.DELAYS:
-        refuse_phase(system, parameter_ref, _LOCATION)
+        refuse_phase(model, parameter_ref, _LOCATION)
         if not choice.linearized:
-            raise delay_search_refused(system)
+            raise delay_search_refused(model)
         begin = limits[0] or Fraction(0)
-        end = limits[1] or delay_reach(system, parameter_ref, begin, pieces=PIECES, further=FURTHER)[0]
-        ended = delay_progress(system, parameter_ref, begin, end, location=_LOCATION, progress=progress)
+        end = limits[1] or delay_reach(model, parameter_ref, begin, pieces=PIECES, further=FURTHER)[0]
+        ended = delay_progress(model, parameter_ref, begin, end, location=_LOCATION, progress=progress)
         paths = [DelayPath(parameter_ref, start, begin, end, ended) for start in choice.linearized]
         reported = None
     elif choice.kind is EvaluatorKind.POINTS:
@@ -421,8 +421,8 @@ def _pointwise_path(
     numeric: NumericModel, parameter_ref: ParameterRef, ends: Ends, criterion: str
 ) -> PointwisePath:
     """Return the path along a parameter by analyses, value by value."""
-    system = numeric.model
-    points, least = line_points(system, parameter_ref, *ends, scale_of(system, parameter_ref))
+    model = numeric.model
+    points, least = line_points(model, parameter_ref, *ends, scale_of(model, parameter_ref))
     return PointwisePath(radius_evaluator(numeric, (parameter_ref,), _LOCATION, criterion), points, least)
 
 
@@ -436,7 +436,7 @@ def _limit(
 
 
 def _check_limits(
-    system: Model, parameter_ref: ParameterRef, limits: Sequence[Fraction | None], *, timed: bool
+    model: Model, parameter_ref: ParameterRef, limits: Sequence[Fraction | None], *, timed: bool
 ) -> None:
     """Raise ApcError for a limit out of bounds (E843), and for an empty range (E842).
 
@@ -444,11 +444,11 @@ def _check_limits(
     parameter is a time.
     """
     low, high = limits
-    minimum = 0.0 if timed else parameter_of(system, parameter_ref).minimum
-    maximum = None if timed else parameter_of(system, parameter_ref).maximum
-    unit = "s" if timed else parameter_of(system, parameter_ref).unit
+    minimum = 0.0 if timed else parameter_of(model, parameter_ref).minimum
+    maximum = None if timed else parameter_of(model, parameter_ref).maximum
+    unit = "s" if timed else parameter_of(model, parameter_ref).unit
     for value in (low, high):
-        if value is not None and timed and not value and reaches_period(system, parameter_ref):
+        if value is not None and timed and not value and reaches_period(model, parameter_ref):
             message = f"limit of {parameter_ref.name}"
             raise ApcError(Diagnostic("E843", _LOCATION, message, "more than 0 s", "0 s"))
         if value is not None and (

@@ -106,15 +106,15 @@ def _segments(
     numeric: NumericModel, parameter_ref: ParameterRef
 ) -> Callable[[Fraction, Fraction], DelaySegment]:
     """Return the function that builds the segment between two values, cached for models of few states."""
-    system = numeric.model
-    slopes, follows = timing_slopes(system, parameter_ref), reaches_parameters(system, parameter_ref)
+    model = numeric.model
+    slopes, follows = timing_slopes(model, parameter_ref), reaches_parameters(model, parameter_ref)
     build = partial(_segment, numeric, parameter_ref, slopes=slopes, follows=follows)
     states = sum(map(states_of, numeric.schedules, numeric.subsystems))
     return lru_cache(maxsize=CACHED_SEGMENTS)(build) if states <= FEW_STATES else build
 
 
 def delay_progress(
-    system: Model,
+    model: Model,
     parameter_ref: ParameterRef,
     low: Fraction,
     high: Fraction,
@@ -126,13 +126,13 @@ def delay_progress(
 
     Parameters
     ----------
-    system, parameter_ref, low, high, location
+    model, parameter_ref, low, high, location
         As for `delay_segments`, with the same errors.
     progress
         The receiver of texts with the elapsed time, and with the remaining time if it can be estimated.
     """
     pieces = _segment_count(
-        parameter_ref, low, high, borders(system, parameter_ref, location=location), location
+        parameter_ref, low, high, borders(model, parameter_ref, location=location), location
     )
     remaining, done = RemainingTime(), 0
 
@@ -184,7 +184,7 @@ def _segment_count(
 
 @lru_cache(maxsize=CACHE_SIZE)
 def borders(
-    system: Model, parameter_ref: ParameterRef, *, location: SourceLocation
+    model: Model, parameter_ref: ParameterRef, *, location: SourceLocation
 ) -> Callable[[Fraction], Fraction]:
     """Return the function from a delay to the next larger delay at which events coincide.
 
@@ -197,25 +197,25 @@ def borders(
     ApcError
         E844 a period or phase, or a timing that is not linear in the parameter.
     """
-    fixed = {time for clock in system.clocks for time in (clock.period, clock.phase)}
+    fixed = {time for clock in model.clocks for time in (clock.period, clock.phase)}
     if parameter_ref.name in fixed:
         raise _clock_time_error(parameter_ref, location)
-    now = delay_now(system, parameter_ref)
+    now = delay_now(model, parameter_ref)
     timings_at = [
-        resolve(system_with_delay(system, parameter_ref, now + share * STEP)).timings for share in (0, 1, 2)
+        resolve(system_with_delay(model, parameter_ref, now + share * STEP)).timings for share in (0, 1, 2)
     ]
-    slopes = timing_slopes(system, parameter_ref)
+    slopes = timing_slopes(model, parameter_ref)
     if any(slopes[name] for name in fixed):
         raise _clock_time_error(parameter_ref, location)
     for name, slope in slopes.items():
         if timings_at[2][name] != timings_at[0][name] + 2 * slope * STEP:
             message = f"{name} is not linear in {parameter_ref.name}, so its critical value can't be searched"
             raise ApcError(Diagnostic("E844", location, message))
-    clocks = {clock.name: clock for clock in system.clocks}
+    clocks = {clock.name: clock for clock in model.clocks}
     holds = dict.fromkeys(
-        (hold.clock, hold.delay) for peer_type in system.peer_types for hold in peer_type.holds
+        (hold.clock, hold.delay) for peer_type in model.peer_types for hold in peer_type.holds
     )
-    packets = dict.fromkeys((link.clock_at(delay), delay) for link in system.links for delay in link.delays)
+    packets = dict.fromkeys((link.clock_at(delay), delay) for link in model.links for delay in link.delays)
     ticks = [(name, "") for name in clocks]
     event_pairs = [
         *itertools.product(holds, [*ticks, *holds]),
@@ -248,10 +248,10 @@ def borders(
     return following
 
 
-def reaches_parameters(system: Model, parameter_ref: ParameterRef) -> bool:
+def reaches_parameters(model: Model, parameter_ref: ParameterRef) -> bool:
     """Return whether a number that affects delays is also an equation parameter, or affects one."""
     first, second = (
-        resolve(system_with_delay(system, parameter_ref, value)).parameters
+        resolve(system_with_delay(model, parameter_ref, value)).parameters
         for value in (Fraction(1), Fraction(2))
     )
     return not all(np.array_equal(*pair) for pair in zip(first, second, strict=True))
@@ -287,12 +287,12 @@ def _segment(
     follows
         Whether any coefficient may depend on the delay, not only the time between events.
     """
-    system = numeric.model
+    model = numeric.model
     delay = low + INSIDE * (high - low)
-    inside = numeric.at(system_with_delay(system, parameter_ref, delay))
+    inside = numeric.at(system_with_delay(model, parameter_ref, delay))
     durations: dict[int, tuple[float, float]] = {}
-    for schedule, group in zip(inside.schedules, system.groups, strict=True):
-        for quanta, slope in _duration_slopes(schedule, system.peer_types[group.peer_type], slopes).items():
+    for schedule, group in zip(inside.schedules, model.groups, strict=True):
+        for quanta, slope in _duration_slopes(schedule, model.peer_types[group.peer_type], slopes).items():
             durations[quanta] = (float(quanta * schedule.quantum - slope * delay), float(slope))
     if not follows and not any(slope for _, slope in durations.values()):
         return DelaySegment(low, high, None, inside.model)

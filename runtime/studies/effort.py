@@ -40,22 +40,22 @@ class Effort:
     sent_by_all: float
 
 
-def effort(system: Model) -> Effort:
+def effort(model: Model) -> Effort:
     """Return the cost of a scheme: operations per tick, and numbers sent per second.
 
     Parameters
     ----------
-    system
+    model
         The model.
     """
-    peer_types = [system.peer_types[group.peer_type] for group in system.groups]
-    counts = np.array([group.count for group in system.groups], dtype=np.int64)
-    names = np.array([group.name for group in system.groups])
-    timings = resolve(system).timings
-    rates = {clock.name: float(1 / timings[clock.period]) for clock in system.clocks}
+    peer_types = [model.peer_types[group.peer_type] for group in model.groups]
+    counts = np.array([group.count for group in model.groups], dtype=np.int64)
+    names = np.array([group.name for group in model.groups])
+    timings = resolve(model).timings
+    rates = {clock.name: float(1 / timings[clock.period]) for clock in model.clocks}
     received: dict[str, Integers] = {}
     largest_rates, total_rates = np.zeros(len(peer_types)), np.zeros(len(peer_types))
-    for link in system.links:
+    for link in model.links:
         channels = np.array([_channels(peer_type, link) for peer_type in peer_types], dtype=np.int64)
         receives = np.array([_receives(peer_type, link) for peer_type in peer_types])
         packets = np.full((len(counts), len(counts)), rates[link.clock])

@@ -65,7 +65,7 @@ class JoinedEvaluator:
     sequence.
     """
 
-    system: Model
+    model: Model
     free: tuple[ParameterRef, ...]
     sources: tuple[BatchEvaluator, ...]
 
@@ -101,7 +101,7 @@ class PiecewiseEvaluator:
     shared: list[BatchEvaluator] = field(default_factory=list)
 
     @property
-    def system(self) -> Model:
+    def model(self) -> Model:
         """The compiled model."""
         return self.numeric.model
 
@@ -123,8 +123,8 @@ class PiecewiseEvaluator:
             remaining, index = remaining[~certain], index + 1
         for row in remaining.tolist():
             with contextlib.suppress(ApcError):
-                overrides = overrides_at(self.system, self.free, values[row].tolist())
-                separate_blocks = _relative_matrices(self.numeric.at(apply(self.system, overrides)))
+                overrides = overrides_at(self.model, self.free, values[row].tolist())
+                separate_blocks = _relative_matrices(self.numeric.at(apply(self.model, overrides)))
                 matrices[row] = self._block_diagonal([block[None] for block in separate_blocks])[0]
         return ((matrices, slopes),)
 
@@ -134,7 +134,7 @@ class PiecewiseEvaluator:
 
     def _evaluator_around(self, value: Floats) -> BatchEvaluator:
         """Return the evaluator of the points with the same rigid modes as the point `value` (m,)."""
-        system_at_value = apply(self.system, overrides_at(self.system, self.free, value.tolist()))
+        system_at_value = apply(self.model, overrides_at(self.model, self.free, value.tolist()))
         result = batch_evaluator(
             system_at_value,
             self.free,
@@ -268,21 +268,21 @@ def evaluator_of_many(
     return result
 
 
-def generic(system: Model, parameter_refs: Sequence[ParameterRef]) -> Model:
+def generic(model: Model, parameter_refs: Sequence[ParameterRef]) -> Model:
     """Return the model with generic values of the free parameters: peers equal there are equal at
     every value.
     """
     overrides = []
     for index, parameter_ref in enumerate(parameter_refs):
-        value = Fraction(parameter_of(system, parameter_ref).value)
+        value = Fraction(parameter_of(model, parameter_ref).value)
         change = GENERIC * Fraction(index + 3, 3)
         overrides.append(Override(parameter_ref, value * (1 + change) if value else change))
     unbounded = replace(
-        system,
-        parameters=tuple(_without_bounds(parameter) for parameter in system.parameters),
+        model,
+        parameters=tuple(_without_bounds(parameter) for parameter in model.parameters),
         groups=tuple(
             replace(group, values=tuple(_without_bounds(parameter) for parameter in group.values))
-            for group in system.groups
+            for group in model.groups
         ),
     )
     return apply(unbounded, overrides)
@@ -293,7 +293,7 @@ def _without_bounds(parameter: Parameter) -> Parameter:
     return replace(parameter, minimum=None, exclusive_minimum=False, maximum=None)
 
 
-def free_parameters(system: Model) -> list[ParameterRef]:
+def free_parameters(model: Model) -> list[ParameterRef]:
     """Return the independent parameters that affect neither times nor counts, each by its settable name.
 
     A parameter is common to all groups if no group has its own value; otherwise there is one for each group
@@ -301,67 +301,65 @@ def free_parameters(system: Model) -> list[ParameterRef]:
     an expression, are left out.
     """
     parameter_refs = []
-    excluded = scope_of(system).needed(
-        [*(timing.name for timing in system.timings), *(group_count(group.name) for group in system.groups)]
+    excluded = scope_of(model).needed(
+        [*(timing.name for timing in model.timings), *(group_count(group.name) for group in model.groups)]
     )
-    for parameter in system.parameters:
+    for parameter in model.parameters:
         if parameter.formula is not None or not is_named(parameter.name) or parameter.name in excluded:
             continue
         not_single = {
             group.name: any(column.name == parameter.name for column in group.columns)
             or any(value.name == parameter.name and value.formula for value in group.values)
-            for group in system.groups
+            for group in model.groups
         }
-        has_own_values = any(
-            value.name == parameter.name for group in system.groups for value in group.values
-        )
+        has_own_values = any(value.name == parameter.name for group in model.groups for value in group.values)
         if not has_own_values and not any(not_single.values()):
             parameter_refs.append(ParameterRef(parameter.name))
             continue
         parameter_refs += [
             ParameterRef(parameter.name, group.name)
-            for group in system.groups
-            if not not_single[group.name] and _affects_group(system, group, parameter.name)
+            for group in model.groups
+            if not not_single[group.name] and _affects_group(model, group, parameter.name)
         ]
     return parameter_refs
 
 
-def _affects_group(system: Model, group: Group, name: str) -> bool:
+def _affects_group(model: Model, group: Group, name: str) -> bool:
     """Return whether a parameter's value in a group enters the group's equations."""
     values = {ParameterRef(name, group.name): np.array([float(GENERIC), float(2 * GENERIC)])}
     with np.errstate(all="ignore"):
-        return len(free_rows(system, group, 0, values)) > 1
+        return len(free_rows(model, group, 0, values)) > 1
 
 
 def overrides_at(
-    system: Model, parameter_refs: Sequence[ParameterRef], value: Sequence[float]
+    model: Model, parameter_refs: Sequence[ParameterRef], value: Sequence[float]
 ) -> list[Override]:
     """Return the overrides to a point (m,).
 
     Counts are rounded, periods replaced by periods of short frames.
     """
     return [
-        Override(parameter_ref, _valid_value(system, parameter_ref, number))
+        Override(parameter_ref, _valid_value(model, parameter_ref, number))
         for parameter_ref, number in zip(parameter_refs, value, strict=True)
     ]
 
 
-def _valid_value(system: Model, parameter_ref: ParameterRef, number: float) -> Fraction:
+def _valid_value(model: Model, parameter_ref: ParameterRef, number: float) -> Fraction:
     """Return the nearest valid value of a parameter: an integer count, or a period of short frames."""
-    if reaches_count(system, parameter_ref):
+    if reaches_count(model, parameter_ref):
         return Fraction(round(number))
-    if reaches_time(system, parameter_ref):
-        return nearest_period(system, parameter_ref, Fraction(number))
+    if reaches_time(model, parameter_ref):
+        return nearest_period(model, parameter_ref, Fraction(number))
     return Fraction(number)
 
 
-def reaches_count(system: Model, parameter_ref: ParameterRef) -> bool:
+def reaches_count(model: Model, parameter_ref: ParameterRef) -> bool:
     """Return whether the number of peers of some group is, or depends on, this parameter."""
-    return parameter_ref.name in scope_of(system).needed([group_count(group.name) for group in system.groups])
+    return parameter_ref.name in scope_of(model).needed([group_count(group.name) for group in model.groups])
 
 
-def reaches_time(system: Model, parameter_ref: ParameterRef) -> bool:
+def reaches_time(model: Model, parameter_ref: ParameterRef) -> bool:
     """Return whether a period, phase or delay is, or depends on, this parameter."""
-    if times_of(system, parameter_ref.name):
+    if times_of(model, parameter_ref.name):
         return True
-    return parameter_ref.name in scope_of(system).needed([timing.name for timing in system.timings])
+    return parameter_ref.name in scope_of(model).needed([timing.name for timing in model.timings])

@@ -47,13 +47,13 @@ class EvaluatorChoice:
     smooth: NumericModel | None
 
 
-def kind_for_parameter(system: Model, parameter_ref: ParameterRef) -> EvaluatorKind:
+def kind_for_parameter(model: Model, parameter_ref: ParameterRef) -> EvaluatorKind:
     """Return the kind of evaluator that one parameter requires in an affine model."""
-    if reaches_count(system, parameter_ref):
+    if reaches_count(model, parameter_ref):
         return EvaluatorKind.COUNTS
-    if not reaches_time(system, parameter_ref):
+    if not reaches_time(model, parameter_ref):
         return EvaluatorKind.MATRICES
-    return EvaluatorKind.PERIODS if reaches_period(system, parameter_ref) else EvaluatorKind.DELAYS
+    return EvaluatorKind.PERIODS if reaches_period(model, parameter_ref) else EvaluatorKind.DELAYS
 
 
 def evaluator_for(
@@ -106,6 +106,6 @@ def _sides_change(numeric: NumericModel, parameter_refs: Sequence[ParameterRef])
 
     The sides of max(k x, l x) at x = 0 are one where k = l, and two at any other k.
     """
-    system = numeric.model
-    gains = [ref for ref in parameter_refs if kind_for_parameter(system, ref) is EvaluatorKind.MATRICES]
-    return bool(gains) and len(sides(numeric.at(generic(system, gains)))) != len(sides(numeric))
+    model = numeric.model
+    gains = [ref for ref in parameter_refs if kind_for_parameter(model, ref) is EvaluatorKind.MATRICES]
+    return bool(gains) and len(sides(numeric.at(generic(model, gains)))) != len(sides(numeric))

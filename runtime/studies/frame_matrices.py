@@ -74,7 +74,7 @@ class MatrixSource(Protocol):
     """
 
     @property
-    def system(self) -> Model:
+    def model(self) -> Model:
         """The compiled model."""
 
     @property
@@ -131,7 +131,7 @@ class BatchEvaluator:
     coefficient; `fixed` are the exponentials of the classes that do not depend on free parameters.
     """
 
-    system: Model
+    model: Model
     free: tuple[ParameterRef, ...]
     exchange: CommunicationGraph
     groups: tuple[PeerClass, ...]
@@ -183,7 +183,7 @@ class BatchEvaluator:
             return group.parameters[None]
         index, peer = self.first_peer(group)
         values_of = {parameter_ref: values[:, column] for column, parameter_ref in enumerate(self.free)}
-        return free_rows(self.system, self.system.groups[index], peer, values_of)
+        return free_rows(self.model, self.model.groups[index], peer, values_of)
 
     def first_peer(self, group: PeerClass) -> tuple[int, int]:
         """Return the index of the model's group of the first peer of a class, and the peer's index in
@@ -341,7 +341,7 @@ class BatchEvaluator:
 
 
 def batch_evaluator(
-    system: Model,
+    model: Model,
     parameter_refs: Sequence[ParameterRef],
     groups: Sequence[PeerClass],
     exchange: CommunicationGraph,
@@ -354,7 +354,7 @@ def batch_evaluator(
 
     Parameters
     ----------
-    system
+    model
         The compiled model.
     parameter_refs
         The parameters that vary.
@@ -379,7 +379,7 @@ def batch_evaluator(
         {group.jacobians.peer_type.name: _tangent(group.jacobians) for group in groups} if follows else {}
     )
     evaluator = BatchEvaluator(
-        system=system,
+        model=model,
         free=tuple(parameter_refs),
         exchange=exchange,
         groups=tuple(groups),
@@ -396,7 +396,7 @@ def _marked_structures(evaluator: BatchEvaluator) -> tuple[LoopStructure, ...]:
     """Return the loop structures, with rigid directions that depend on parameters marked as such."""
     if not any(wiring.rigid.names for wiring in evaluator.wirings):
         return evaluator.wirings
-    base = np.array([value_now(evaluator.system, parameter_ref) for parameter_ref in evaluator.free])
+    base = np.array([value_now(evaluator.model, parameter_ref) for parameter_ref in evaluator.free])
     other_point = (base * (1 + _generic_point(len(base))[0][0]) + 1e-3).tolist()
     lifted = evaluator.lifted(np.array([other_point]))
     wirings = []

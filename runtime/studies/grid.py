@@ -119,12 +119,12 @@ def _refuse_many(counts: Sequence[int]) -> None:
         raise ApcError(Diagnostic("E883", LOCATION, "sweep", f"at most {MOST_POINTS:,} points", got))
 
 
-def parse_axis(system: Model, name: str, given: Values, *, ends: bool = False) -> GridAxis:
+def parse_axis(model: Model, name: str, given: Values, *, ends: bool = False) -> GridAxis:
     """Return the axis of a swept parameter from its values.
 
     Parameters
     ----------
-    system
+    model
         The compiled model.
     name
         A parameter or timing, as in `--set`.
@@ -141,9 +141,9 @@ def parse_axis(system: Model, name: str, given: Values, *, ends: bool = False) -
         E881 an invalid range or list; E622, E623 an unknown parameter; E204 and other errors of a quantity;
         E624 or E625 a value out of the parameter's bounds.
     """
-    parameter_ref = find(system, name.strip(), LOCATION, counts=True)
-    unit = unit_of(system, parameter_ref.name)
-    is_count = reaches_count(system, parameter_ref)
+    parameter_ref = find(model, name.strip(), LOCATION, counts=True)
+    unit = unit_of(model, parameter_ref.name)
+    is_count = reaches_count(model, parameter_ref)
     default = 2 if ends else DEFAULT_COUNT
     in_range = given if isinstance(given, str) and ":" in given else ""
     if ends or in_range:
@@ -151,7 +151,7 @@ def parse_axis(system: Model, name: str, given: Values, *, ends: bool = False) -
         values = _values_of_range(parameter_ref.label, unit, parts[:2], in_range.split(":")[2:], default)
     else:
         items = given.split(",") if isinstance(given, str) else given
-        choices = choices_of(system, parameter_ref)
+        choices = choices_of(model, parameter_ref)
         named = [item.strip() if isinstance(item, str) else "" for item in items]
         items = [
             Fraction(choices[name]) if name in choices else item
@@ -162,7 +162,7 @@ def parse_axis(system: Model, name: str, given: Values, *, ends: bool = False) -
         values = _whole_numbers(parameter_ref.label, values, every=in_range.count(":") == 1 and not ends)
     axis = GridAxis(parameter_ref, unit, values)
     for value in (min(values), max(values)):
-        _check_bounds(system, axis, value)
+        _check_bounds(model, axis, value)
     return axis
 
 
@@ -255,14 +255,14 @@ def _count(subject: str, text: str) -> int:
     return int(text)
 
 
-def _check_bounds(system: Model, axis: GridAxis, value: Fraction) -> None:
+def _check_bounds(model: Model, axis: GridAxis, value: Fraction) -> None:
     """Raise the error of `apply` for a value that is out of its own bounds.
 
     Errors that also depend on other values (a phase beyond its clock's period, a dependent parameter) belong
     to single points.
     """
     try:
-        apply(system, [Override(axis.free, value)])
+        apply(model, [Override(axis.free, value)])
     except ApcError as error:
         mistakes = [
             mistake

@@ -140,9 +140,9 @@ def margins(numeric: NumericModel, *, quick: bool = False, analysis: Analysis | 
     analysis
         The analysis at the present values, if already computed.
     """
-    system = numeric.model
-    with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
-        parameter_refs, delays = coupler_parameters(system), _delays(system)
+    model = numeric.model
+    with single_threaded(), finite_equations(model.origin.topology), np.errstate(all="ignore"):
+        parameter_refs, delays = coupler_parameters(model), _delays(model)
         linearized = evaluator_for(numeric, [*parameter_refs, *delays]).linearized
         # Times do not move an equilibrium, at which a delay then finds one linearization.
         for_delays = linearized or evaluator_for(numeric, delays).linearized
@@ -154,7 +154,7 @@ def margins(numeric: NumericModel, *, quick: bool = False, analysis: Analysis | 
         slow = largest > MOST_SCANNED and many_packets(first_side)
         searched = parameter_refs if slow or largest <= MOST_SCANNED else []
         skipped = [
-            not_evaluated(system, parameter_ref, f"{largest:,} states")
+            not_evaluated(model, parameter_ref, f"{largest:,} states")
             for parameter_ref in parameter_refs
             if parameter_ref not in searched
         ]
@@ -166,7 +166,7 @@ def margins(numeric: NumericModel, *, quick: bool = False, analysis: Analysis | 
         paths = _margin_paths(numeric, () if slow else linearized, searched)
         rows = [
             _margin(
-                system,
+                model,
                 parameter_ref,
                 stable_in_all([search(path, first=True) for path in of_parameter]),
                 pointwise=slow or not linearized,
@@ -200,31 +200,31 @@ def _loop_sizes(numeric: NumericModel, *, most: float) -> list[int]:
     return states if events + sum(state**2 for state in states) <= most else []
 
 
-def coupler_parameters(system: Model) -> list[ParameterRef]:
+def coupler_parameters(model: Model) -> list[ParameterRef]:
     """Return the stiffnesses and dampings of parts without states, and the named ones."""
-    moving = {state.name.rpartition(".")[0] for peer_type in system.peer_types for state in peer_type.states}
+    moving = {state.name.rpartition(".")[0] for peer_type in model.peer_types for state in peer_type.states}
     return [
         parameter_ref
-        for parameter_ref in free_parameters(system)
-        if parameter_of(system, parameter_ref).unit in UNITS
+        for parameter_ref in free_parameters(model)
+        if parameter_of(model, parameter_ref).unit in UNITS
         and parameter_ref.name.rpartition(".")[0] not in moving
     ]
 
 
-def _delays(system: Model) -> list[ParameterRef]:
+def _delays(model: Model) -> list[ParameterRef]:
     """Return the delays of holds and links, or the named time on which all of them depend.
 
     A link's own delay is left out if every pair of groups has a separate delay.
     """
-    independent = {timing.name for timing in named_times(system) if timing.formula is None}
-    delay_names = [hold.delay for peer_type in system.peer_types for hold in peer_type.holds]
+    independent = {timing.name for timing in named_times(model) if timing.formula is None}
+    delay_names = [hold.delay for peer_type in model.peer_types for hold in peer_type.holds]
     directions = {
         (sender.name, receiver.name)
-        for sender in system.groups
-        for receiver in system.groups
+        for sender in model.groups
+        for receiver in model.groups
         if sender is not receiver or sender.count > 1
     }
-    for link in system.links:
+    for link in model.links:
         separate = {(pair.sender, pair.receiver) for pair in link.pairs if pair.delay in independent}
         delay_names += link.delays if directions - separate else link.delays[1:]
     return [ParameterRef(name) for name in dict.fromkeys(delay_names) if name in independent]
@@ -239,14 +239,14 @@ def _margin_paths(
     path whose values are analyzed separately. A parameter of 0 has a separate evaluator: a mode that is rigid
     at a stiffness of 0 is not rigid at other values.
     """
-    system = numeric.model
-    base = np.array([parameter_of(system, parameter_ref).value for parameter_ref in parameter_refs])
+    model = numeric.model
+    base = np.array([parameter_of(model, parameter_ref).value for parameter_ref in parameter_refs])
     nonzero = [parameter_ref for parameter_ref, value in zip(parameter_refs, base, strict=True) if value]
     for parameter_ref, present in zip(parameter_refs, base.tolist(), strict=True):
-        most = allowed(system, parameter_ref)[1]
+        most = allowed(model, parameter_ref)[1]
         if not linearized:
             source = RadiusEvaluator(numeric, (parameter_ref,), LOCATION, NOMINAL)
-            points, least = _margin_points(system, parameter_ref, abs(scale_of(system, parameter_ref)))
+            points, least = _margin_points(model, parameter_ref, abs(scale_of(model, parameter_ref)))
             yield [PointwisePath(source, points, least)] if points[-1] > present else []
             continue
         varied = nonzero if present else [parameter_ref]
@@ -267,35 +267,35 @@ def _delay_margin(
     `linearized` are the sides of a kink, or the model; `largest` is the number of states of its largest loop;
     `analysis` is that at the present values.
     """
-    system = linearized[0].model
-    if len(times_of(system, parameter_ref.name)) > 1:
-        return not_evaluated(system, parameter_ref, "the value differs between groups")
-    now = delay_now(system, parameter_ref)
-    end, count = delay_reach(system, parameter_ref, now, pieces=PIECES, further=FURTHER)
+    model = linearized[0].model
+    if len(times_of(model, parameter_ref.name)) > 1:
+        return not_evaluated(model, parameter_ref, "the value differs between groups")
+    now = delay_now(model, parameter_ref)
+    end, count = delay_reach(model, parameter_ref, now, pieces=PIECES, further=FURTHER)
     if count > MOST_PIECES:
-        return not_evaluated(system, parameter_ref, f"{count} orders of events up to {float(end):.4g} s")
+        return not_evaluated(model, parameter_ref, f"{count} orders of events up to {float(end):.4g} s")
     is_link_delay = all(
-        parameter_ref.name != hold.delay for peer_type in system.peer_types for hold in peer_type.holds
+        parameter_ref.name != hold.delay for peer_type in model.peer_types for hold in peer_type.holds
     )
     if largest > MOST_DELAYED and not is_link_delay:
-        return not_evaluated(system, parameter_ref, f"{largest:,} states in each order of events")
+        return not_evaluated(model, parameter_ref, f"{largest:,} states in each order of events")
     try:
         known = {now: verdict_of(analysis)} if len(linearized) == 1 else {}
         paths = [DelayPath(parameter_ref, side, now, end, known=dict(known)) for side in linearized]
-        return _margin(system, parameter_ref, stable_in_all([search(path, first=True) for path in paths]))
+        return _margin(model, parameter_ref, stable_in_all([search(path, first=True) for path in paths]))
     except ApcError as error:
-        return not_evaluated(system, parameter_ref, error.mistakes[0].message)
+        return not_evaluated(model, parameter_ref, error.mistakes[0].message)
 
 
-def not_evaluated(system: Model, parameter_ref: ParameterRef, why: str) -> Margin:
+def not_evaluated(model: Model, parameter_ref: ParameterRef, why: str) -> Margin:
     """Return the entry of a parameter that was not searched, with the reason."""
-    present = value_now(system, parameter_ref)
-    unit = unit_of(system, parameter_ref.name)
+    present = value_now(model, parameter_ref)
+    unit = unit_of(model, parameter_ref.name)
     return Margin(parameter_ref.label, unit, present, None, None, None, None, "", present, why)
 
 
 def _margin(
-    system: Model, parameter_ref: ParameterRef, search: CrossingReport, *, pointwise: bool = False
+    model: Model, parameter_ref: ParameterRef, search: CrossingReport, *, pointwise: bool = False
 ) -> Margin | None:
     """Return the margin from a search, None if no eigenvalue depends on the parameter.
 
@@ -303,8 +303,8 @@ def _margin(
     """
     if not search.has_effect and not pointwise:
         return None
-    present = value_now(system, parameter_ref)
-    row = replace(not_evaluated(system, parameter_ref, ""), searched_to=search.searched_to[1])
+    present = value_now(model, parameter_ref)
+    row = replace(not_evaluated(model, parameter_ref, ""), searched_to=search.searched_to[1])
     crossing = next((edge for edge in search.edges if edge.stable_side == "below"), None)
     if crossing is None and search.stable[:1] == (False,):
         # Stable at the present value, and unstable at every larger value.
@@ -337,15 +337,15 @@ def network_margins(numeric: NumericModel, nominal: Margins, *, quick: bool = Fa
     quick
         Whether expensive margins are left out.
     """
-    system = numeric.model
+    model = numeric.model
     with (
         part("margins"),
         single_threaded(),
-        finite_equations(system.origin.topology),
+        finite_equations(model.origin.topology),
         np.errstate(all="ignore"),
     ):
-        parameter_refs = [*coupler_parameters(system), *channel_parameters(system)]
-        states = max(len(peer_type.states) for peer_type in system.peer_types)
+        parameter_refs = [*coupler_parameters(model), *channel_parameters(model)]
+        states = max(len(peer_type.states) for peer_type in model.peer_types)
         if quick and len(parameter_refs) * states > MOST_GROWN_IN_PASSING:
             count = f"{len(parameter_refs)} parameters and {states} states"
             return Margins((), f"not computed by default: {count} (apc analyze --margins)")
@@ -366,16 +366,16 @@ def network_margins(numeric: NumericModel, nominal: Margins, *, quick: bool = Fa
         open_sides, evaluations = [], 0
         ended_early: dict[str, list[str]] = {}
         for item in parameter_refs:
-            scale = abs(value_now(system, item)) or scales.get(item.label, 0.0)
-            points, least = _margin_points(system, item, scale)
+            scale = abs(value_now(model, item)) or scales.get(item.label, 0.0)
+            points, least = _margin_points(model, item, scale)
             unscaled = not nominal.rows or item.label in open_rows
             if unscaled and len(points) == 1:
-                rows.append(not_evaluated(system, item, "no search range follows from the present value 0"))
+                rows.append(not_evaluated(model, item, "no search range follows from the present value 0"))
                 continue
             source = radius_evaluator(numeric, (item,), LOCATION)
             result = search(PointwisePath(source, points, least), first=True)
             evaluations += result.evaluations
-            rows.append(_margin(system, item, result, pointwise=True))
+            rows.append(_margin(model, item, result, pointwise=True))
             if rows[-1] and result.why:
                 ended_early.setdefault(result.why, []).append(item.label)
             if rows[-1] and result.edges and result.edges[0].proof != BOUNDED[MEAN_SQUARE]:
@@ -390,23 +390,23 @@ def network_margins(numeric: NumericModel, nominal: Margins, *, quick: bool = Fa
     return Margins(tuple(filter(None, rows)), "\n".join(notes))
 
 
-def _margin_points(system: Model, parameter_ref: ParameterRef, scale: float) -> tuple[Floats, float]:
+def _margin_points(model: Model, parameter_ref: ParameterRef, scale: float) -> tuple[Floats, float]:
     """Return the sampled values of a parameter, analyzed one by one, and the value below which cells no
     longer become narrower.
     """
-    present, most = value_now(system, parameter_ref), allowed(system, parameter_ref)[1]
-    if parameter_ref.name in channel_numbers(system):
+    present, most = value_now(model, parameter_ref), allowed(model, parameter_ref)[1]
+    if parameter_ref.name in channel_numbers(model):
         delays = [
-            value_now(system, ParameterRef(delay))
-            for link in system.links
+            value_now(model, ParameterRef(delay))
+            for link in model.links
             for delay in link.delays
             if (channel := link.channel_at(delay)) and channel.jitter == parameter_ref.name
         ]
         most = min([most, *delays])
         if not np.isfinite(most):  # a named number that a loss or a jitter depends on
-            most = 1.0 if unit_of(system, parameter_ref.name) == "1" else GROWTH * abs(scale)
+            most = 1.0 if unit_of(model, parameter_ref.name) == "1" else GROWTH * abs(scale)
         points = np.linspace(present, most, SHARES + 1)
         return points, float(points[1])
     if not scale:
         return np.array([present]), 1.0
-    return line_points(system, parameter_ref, present, min(GROWTH * scale, most), scale)
+    return line_points(model, parameter_ref, present, min(GROWTH * scale, most), scale)

@@ -146,18 +146,18 @@ def moment_evaluator(
     location
         The location of the request, for errors.
     """
-    system, refs = numeric.model, tuple(parameter_refs)
+    model, refs = numeric.model, tuple(parameter_refs)
     plain = RadiusEvaluator(numeric, refs, location)
-    channels = channel_numbers(system)
+    channels = channel_numbers(model)
     if (
-        not independent_channels(system)
+        not independent_channels(model)
         or not all(subsystem.parameters_suffice for subsystem in numeric.subsystems)
         or any(ref.name in channels for ref in refs)
-        or any(reaches_time(system, ref) or reaches_count(system, ref) for ref in refs)
+        or any(reaches_time(model, ref) or reaches_count(model, ref) for ref in refs)
     ):
         return plain
-    present = np.array([value_now(system, ref) for ref in refs], dtype=np.float64)
-    generic_point = numeric.at(generic(system, refs))
+    present = np.array([value_now(model, ref) for ref in refs], dtype=np.float64)
+    generic_point = numeric.at(generic(model, refs))
     if any(sides(point)[0].numeric is not point for point in (numeric, generic_point)):
         return plain
     reception = build_reception(generic_point)

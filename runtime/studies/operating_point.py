@@ -19,13 +19,13 @@ SIMULATION = "simulation"
 
 
 def operating_point(
-    system: Model, *, initial: str = START, duration: Fraction | None = None
+    model: Model, *, initial: str = START, duration: Fraction | None = None
 ) -> OperatingPoint:
     """Return the equilibrium of a model.
 
     Parameters
     ----------
-    system
+    model
         The model at its parameter values.
     initial
         The start of the search: "start" or "simulation".
@@ -38,14 +38,14 @@ def operating_point(
         E840 another start; the errors of `rest_position.operating_point_from` and `trajectory.simulate`.
     """
     if initial == START:
-        return operating_point_from(system)
+        return operating_point_from(model)
     if initial != SIMULATION:
         location, expected = SourceLocation("operating_point"), f"{START} or {SIMULATION}"
         raise ApcError(Diagnostic("E840", location, "initial", expected, initial[:40]))
-    refuse_joins_and_leaves(system, "operating_point")
-    trajectory = simulate(system, duration=duration)
+    refuse_joins_and_leaves(model, "operating_point")
+    trajectory = simulate(model, duration=duration)
     final = {
         signal.name: float(value)
         for signal, value in zip(trajectory.signals, trajectory.values[-1], strict=True)
     }
-    return operating_point_from(system, final, SIMULATION)
+    return operating_point_from(model, final, SIMULATION)

@@ -144,7 +144,7 @@ class MatrixPath(SingleSegment):
     def verdict_at(self, value: Fraction) -> Verdict:
         """Return the verdict of an analysis at a value."""
         change = Override(self.evaluator.free[self.column], value)
-        return analyzed(self.numeric, apply(self.evaluator.system, [change]))
+        return analyzed(self.numeric, apply(self.evaluator.model, [change]))
 
     @cached_property
     def _parts(self) -> tuple[tuple[DrivingPart, ...], tuple[NDArray[np.bool_], ...]]:
@@ -157,7 +157,7 @@ class MatrixPath(SingleSegment):
         free = self.evaluator.free[self.column]
         try:
             models = [
-                self.numeric.at(apply(self.evaluator.system, [Override(free, value)])) for value in values
+                self.numeric.at(apply(self.evaluator.model, [Override(free, value)])) for value in values
             ]
         except ApcError:  # an analysis at each value finds the cause
             return result
@@ -382,21 +382,21 @@ class DelayPath(AnalyzedPath):
 
 
 def delay_reach(
-    system: Model, parameter_ref: ParameterRef, low: Fraction, *, pieces: int, further: float
+    model: Model, parameter_ref: ParameterRef, low: Fraction, *, pieces: int, further: float
 ) -> tuple[Fraction, int]:
     """Return the default end of a delay search, and its number of segments.
 
     Parameters
     ----------
-    system, parameter_ref
+    model, parameter_ref
         The compiled model, and the parameter that varies.
     low
         The start of the search.
     pieces, further
         The minimum number of segments, and the maximum multiple of the present value.
     """
-    next_border = borders(system, parameter_ref, location=LOCATION)
-    least_end = Fraction(further) * delay_now(system, parameter_ref)
+    next_border = borders(model, parameter_ref, location=LOCATION)
+    least_end = Fraction(further) * delay_now(model, parameter_ref)
     border, count = low, 0
     while count < pieces or border < least_end:
         border, count = next_border(border), count + 1
@@ -410,14 +410,14 @@ class PeerCountPath(AnalyzedPath):
     Larger numbers are sampled sparsely.
     """
 
-    system: Model
+    model: Model
     verdict_of: Callable[[Model], bool | None]
     first: int
     last: int
 
     def _verdict(self, value: Fraction) -> Verdict:
         """Return the verdict of the model with this number of peers."""
-        return classified(self.verdict_of(apply(self.system, [Override(self.free, value)])))
+        return classified(self.verdict_of(apply(self.model, [Override(self.free, value)])))
 
     def smooth_segments(self) -> Iterator[SmoothSegment]:
         """Yield the first sampled counts in order, a segment each."""

@@ -30,12 +30,12 @@ from apc.studies.representative_delays import LOCATION
 from apc.support.option_value import NamedValues, named_values, option_values, text_of
 
 
-def parse_range(system: Model, given: str | NamedValues, location: SourceLocation = LOCATION) -> Range:
+def parse_range(model: Model, given: str | NamedValues, location: SourceLocation = LOCATION) -> Range:
     """Return the range that a text `NAME=±P%` or `NAME=LOW UNIT:HIGH UNIT` gives to a parameter.
 
     Parameters
     ----------
-    system
+    model
         The compiled model.
     given
         The text, or the name and the two ends; the name as in `parameter_names.find`.
@@ -51,10 +51,10 @@ def parse_range(system: Model, given: str | NamedValues, location: SourceLocatio
     name, values = named_values(given)
     value = values if isinstance(values, str) else " to ".join(text_of(end, "1") for end in values)
     if not name:
-        raise _malformed("range", value, proposed_range(system), location)
-    parameter_ref = find(system, name, location)
-    parameter = _parameter(system, parameter_ref, location)
-    proposed = proposed_range_of(system, parameter_ref)
+        raise _malformed("range", value, proposed_range(model), location)
+    parameter_ref = find(model, name, location)
+    parameter = _parameter(model, parameter_ref, location)
+    proposed = proposed_range_of(model, parameter_ref)
     malformed = _malformed(f"range of {name}", value, proposed, location)
     if not value or (not isinstance(values, str) and len(values) != 2):
         raise malformed
@@ -105,28 +105,28 @@ def _percentage(text: str) -> Fraction | None:
         return None
 
 
-def _parameter(system: Model, parameter_ref: ParameterRef, location: SourceLocation) -> Parameter:
+def _parameter(model: Model, parameter_ref: ParameterRef, location: SourceLocation) -> Parameter:
     """Return the parameter that varies in a box.
 
     Raises E831 for times other than delays, and for values that differ from peer to peer.
     """
     name, group = parameter_ref.name, parameter_ref.group
-    common = {parameter.name: parameter for parameter in system.parameters}
-    times = {timing.name: timing.value for timing in system.timings}
-    delays = {text for link in system.links for text in link.delays}
+    common = {parameter.name: parameter for parameter in model.parameters}
+    times = {timing.name: timing.value for timing in model.timings}
+    delays = {text for link in model.links for text in link.delays}
     if name in delays:  # analysed segment by segment
         return Parameter(name, "s", float(times[name]), minimum=0.0, exact=times[name])
-    if times_of(system, name) or name in scope_of(system).needed([*times]) or name not in common:
+    if times_of(model, name) or name in scope_of(model).needed([*times]) or name not in common:
         message = (
             f"{name} is a time or sets one; timing parameters have no range, as the event order is "
             "discontinuous in them"
         )
-        is_clock_timing = any(name in (clock.period, clock.phase) for clock in system.clocks)
+        is_clock_timing = any(name in (clock.period, clock.phase) for clock in model.clocks)
         raise ApcError(
             Diagnostic("E831", location, message, fix="" if is_clock_timing else f"apc critical {name}")
         )
-    refuse_choices(system, parameter_ref, location)
-    for item in system.groups:
+    refuse_choices(model, parameter_ref, location)
+    for item in model.groups:
         own_values = {value.name: value for value in item.values}
         columns = {column.name for column in item.columns}
         if group == item.name:

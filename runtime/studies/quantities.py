@@ -57,12 +57,12 @@ class SweepQuantity:
     quick: bool = False
 
 
-def find_quantity(system: Model, text: str) -> SweepQuantity:
+def find_quantity(model: Model, text: str) -> SweepQuantity:
     """Return the quantity of a name, prepared for evaluation at any values of a model.
 
     Parameters
     ----------
-    system
+    model
         The compiled model.
     text
         `NAME`, or `NAME:ARGUMENT` for a quantity with an argument.
@@ -81,7 +81,7 @@ def find_quantity(system: Model, text: str) -> SweepQuantity:
     if constructor is None:
         message = f"{name[:80] or 'an empty name'} is not a quantity of a sweep ({', '.join(QUANTITIES)})"
         raise ApcError(Diagnostic("E884", LOCATION, message, fix=nearest(name, QUANTITIES)))
-    return constructor(system, argument.strip(), criterion)
+    return constructor(model, argument.strip(), criterion)
 
 
 def by_criterion(text: str, criterion: str) -> str:
@@ -95,15 +95,15 @@ def error_row(columns: tuple[TableColumn, ...], error: ApcError) -> Row:
     return (FAULT + first.code, *(None for _ in columns[1:-1]), first.sentence)
 
 
-def _analyze(system: Model, argument: str, criterion: str) -> SweepQuantity:
+def _analyze(model: Model, argument: str, criterion: str) -> SweepQuantity:
     """Return the quantity with the verdict and the spectral radius, or the number of a scalar criterion."""
     if argument:
         raise ApcError(Diagnostic("E884", LOCATION, "analyze", "no parameter", argument[:80], "--of analyze"))
     evaluated = {MEAN_SQUARE: _stability_measure, NOMINAL: _spectral_radius, PASSIVE: _passive}
-    return evaluated[criterion](system)
+    return evaluated[criterion](model)
 
 
-def _spectral_radius(system: Model) -> SweepQuantity:
+def _spectral_radius(model: Model) -> SweepQuantity:
     """Return the quantity with the verdict, the spectral radius, and frequency and damping of the
     dominant mode.
     """
@@ -126,7 +126,7 @@ def _spectral_radius(system: Model) -> SweepQuantity:
                 for axis in grid.axes
                 for exact in [axis.values.__getitem__]
             ]
-            prepared_analyses[:] = [(grid, many_analyses(system, varied))]
+            prepared_analyses[:] = [(grid, many_analyses(model, varied))]
         rows = prepared_analyses[0][1].at(grid.indices(points))
         return (
             rows.verdict,
@@ -136,7 +136,7 @@ def _spectral_radius(system: Model) -> SweepQuantity:
             rows.message,
         )
 
-    return SweepQuantity(columns, cells, by_matrices(system))
+    return SweepQuantity(columns, cells, by_matrices(model))
 
 
 def _finite(numbers: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -144,7 +144,7 @@ def _finite(numbers: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.where(np.isfinite(numbers), numbers, np.nan)
 
 
-def _stability_measure(system: Model) -> SweepQuantity:
+def _stability_measure(model: Model) -> SweepQuantity:
     """Return the quantity with the mean-square verdict and the growth factor of second moments per frame."""
     from apc.lifting.numeric_model import numeric_model  # the nominal quantities need none of it
     from apc.mean_square.mean_square_stability import mean_square_growth, verdict_of
@@ -155,7 +155,7 @@ def _stability_measure(system: Model) -> SweepQuantity:
         TableColumn("mean_square_radius_error", "", "number"),
         MESSAGE,
     )
-    numeric = numeric_model(system)
+    numeric = numeric_model(model)
 
     def evaluate(changed: Model) -> Row:
         """Return the row of one model."""
@@ -164,10 +164,10 @@ def _stability_measure(system: Model) -> SweepQuantity:
         error = max(result.high - result.radius, result.radius - result.low)
         return (verdict_of(result), finite(result.radius), finite(error), result.why or result.note)
 
-    return SweepQuantity(columns, _pointwise(system, columns, evaluate))
+    return SweepQuantity(columns, _pointwise(model, columns, evaluate))
 
 
-def _passive(system: Model) -> SweepQuantity:
+def _passive(model: Model) -> SweepQuantity:
     """Return the quantity with the verdict over every passive hand, and the reserve of each device's
     damping.
     """
@@ -196,11 +196,11 @@ def _passive(system: Model) -> SweepQuantity:
             "",
         )
 
-    return SweepQuantity(columns, _pointwise(system, columns, evaluate))
+    return SweepQuantity(columns, _pointwise(model, columns, evaluate))
 
 
 def _pointwise(
-    system: Model, columns: tuple[TableColumn, ...], evaluate: Callable[[Model], Row]
+    model: Model, columns: tuple[TableColumn, ...], evaluate: Callable[[Model], Row]
 ) -> Callable[[Grid, Sequence[int]], Cells]:
     """Return the function that evaluates points of a grid one by one."""
 
@@ -209,7 +209,7 @@ def _pointwise(
         rows = []
         for point in points:
             try:
-                rows.append(evaluate(apply(system, grid.overrides(point))))
+                rows.append(evaluate(apply(model, grid.overrides(point))))
             except ApcError as error:
                 rows.append(error_row(columns, error))
         kinds = [object if column.kind == "text" else np.float64 for column in columns]  # None is NaN
@@ -221,14 +221,14 @@ def _pointwise(
     return cells
 
 
-def _critical(system: Model, argument: str, criterion: str) -> SweepQuantity:
+def _critical(model: Model, argument: str, criterion: str) -> SweepQuantity:
     """Return the quantity with the critical value of one parameter, its error, and the stable side."""
     from apc.studies.critical_values import critical  # a sweep of verdicts needs none of it
 
     if not argument:
         form = "--of critical:coordination.stiffness"
         raise ApcError(Diagnostic("E884", LOCATION, "critical", "a parameter", "nothing", form))
-    unit = unit_of(system, find(system, argument, LOCATION).name)
+    unit = unit_of(model, find(model, argument, LOCATION).name)
     unit_text = "" if unit == "1" else unit
     columns = (
         VERDICT,
@@ -248,7 +248,7 @@ def _critical(system: Model, argument: str, criterion: str) -> SweepQuantity:
         proof = next(crossing.proof for crossing in result.crossings if crossing.value == result.value)
         return (verdict, finite(result.value), finite(result.error), len(result.crossings), str(proof), "")
 
-    return SweepQuantity(columns, _pointwise(system, columns, evaluate))
+    return SweepQuantity(columns, _pointwise(model, columns, evaluate))
 
 
 QUANTITIES: Mapping[str, Callable[[Model, str, str], SweepQuantity]] = {

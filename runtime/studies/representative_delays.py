@@ -21,12 +21,12 @@ from apc.studies.delay_segments import delay_segments
 LOCATION = SourceLocation("box")
 
 
-def is_delay(system: Model, parameter_ref: ParameterRef) -> bool:
+def is_delay(model: Model, parameter_ref: ParameterRef) -> bool:
     """Return whether a timing is the delay of a link, or of some pairs of its peers."""
-    return any(parameter_ref.name in link.delays for link in system.links)
+    return any(parameter_ref.name in link.delays for link in model.links)
 
 
-def representative_delays(system: Model, delay: Range) -> Iterator[tuple[Fraction, Fraction]]:
+def representative_delays(model: Model, delay: Range) -> Iterator[tuple[Fraction, Fraction]]:
     """Yield delays to analyse, each with the length of the segment that it represents, in seconds.
 
     They are the lower end (length 0) and the midpoint (length of the segment) of each segment between
@@ -37,9 +37,7 @@ def representative_delays(system: Model, delay: Range) -> Iterator[tuple[Fractio
     ApcError
         E831 the delay also delays forces, so that instants of events change continuously with it.
     """
-    segments = delay_segments(
-        numeric_model(system), delay.free, delay.low, location=LOCATION, high=delay.high
-    )
+    segments = delay_segments(numeric_model(model), delay.free, delay.low, location=LOCATION, high=delay.high)
     for segment in segments:
         if segment.evaluator is not None:
             message = f"{delay.free.label} also delays forces; only pure link delays can be ranges"

@@ -146,7 +146,7 @@ CELL = 32
 
 @part("points")
 def sweep(
-    system: Model,
+    model: Model,
     over: Mapping[str, Values],
     *,
     of: str = "analyze",
@@ -161,7 +161,7 @@ def sweep(
 
     Parameters
     ----------
-    system
+    model
         The compiled topology; its values hold for the parameters that are not swept.
     over
         The values of each swept parameter by its name: a range `"0 N/m:3000 N/m:31"` (`LOW:HIGH:COUNT`, and
@@ -192,15 +192,15 @@ def sweep(
         E889 a process ended, or no result came in time. Finished parts remain stored.
     """
     check_size(over.values())
-    grid = build_grid([parse_axis(system, name, values) for name, values in over.items()])
-    chosen_criterion = criterion_of(system, criterion, LOCATION, [axis.free for axis in grid.axes])
+    grid = build_grid([parse_axis(model, name, values) for name, values in over.items()])
+    chosen_criterion = criterion_of(model, criterion, LOCATION, [axis.free for axis in grid.axes])
     work_of = by_criterion(of, chosen_criterion)
-    quantity = find_quantity(system, work_of)
+    quantity = find_quantity(model, work_of)
     for axis in grid.axes:
         if chosen_criterion == PASSIVE:
-            refuse_timing_parameter(system, axis.free, LOCATION, chosen_criterion)
+            refuse_timing_parameter(model, axis.free, LOCATION, chosen_criterion)
         if chosen_criterion == NOMINAL:
-            refuse_channel_number(system, axis.free, LOCATION, instead=f"--criterion {MEAN_SQUARE}")
+            refuse_channel_number(model, axis.free, LOCATION, instead=f"--criterion {MEAN_SQUARE}")
         if axis.free.label == of.partition(":")[2].strip():
             message = f"{axis.free.label} is swept, so its critical value is undefined"
             raise ApcError(
@@ -221,8 +221,8 @@ def sweep(
         message,
         "use fewer values" if is_filed else "use fewer values, or out=FILE.parquet",
     )
-    work = Work(model_bytes(system), work_of, grid, part_points(grid.points, quick=quantity.quick))
-    made_of = _description(system, work)
+    work = Work(model_bytes(model), work_of, grid, part_points(grid.points, quick=quantity.quick))
+    made_of = _description(model, work)
     parts = _open_storage(out, made_of)
     executors = Executors(jobs, cluster, patience or Patience())
     notes = _compute_missing(work, parts, executors, progress)
@@ -238,7 +238,7 @@ def sweep(
         write_table(out, columns, blocks, made_of)
     if isinstance(parts, SweepParts):
         parts.remove()
-    return Sweep(system.name, of, grid, columns, held, *counts, out, made_of, notes)
+    return Sweep(model.name, of, grid, columns, held, *counts, out, made_of, notes)
 
 
 def part_points(points: int, *, quick: bool) -> int:
@@ -255,22 +255,22 @@ def part_points(points: int, *, quick: bool) -> int:
     return max(PART_POINTS, quick_points, -(-points // MOST_PARTS))
 
 
-def _description(system: Model, work: Work) -> dict[str, Any]:
+def _description(model: Model, work: Work) -> dict[str, Any]:
     """Return the description of a sweep as plain data; sweeps with equal descriptions have equal rows."""
-    parameters = {parameter.name: parameter.value for parameter in system.parameters}
-    parameters |= {timing.name: float(timing.value) for timing in system.timings}
+    parameters = {parameter.name: parameter.value for parameter in model.parameters}
+    parameters |= {timing.name: float(timing.value) for timing in model.timings}
     varied = [axis.free for axis in work.grid.axes]
     parameters |= {
-        f"{group.name}.{value.name}": value.value for group in system.groups for value in group.values
+        f"{group.name}.{value.name}": value.value for group in model.groups for value in group.values
     }
     return {
-        "topology": system.name,
-        "peers": system.peers,
+        "topology": model.name,
+        "peers": model.peers,
         "of": work.of,
         "limitations": [
-            *near_start(numeric_model(system)),
-            *limitations(system, network=not work.of.startswith(BEGINNINGS[MEAN_SQUARE]), varied=varied),
-            *notes_for_all_groups(system, varied),
+            *near_start(numeric_model(model)),
+            *limitations(model, network=not work.of.startswith(BEGINNINGS[MEAN_SQUARE]), varied=varied),
+            *notes_for_all_groups(model, varied),
         ],
         "points": work.grid.points,
         "over": [
@@ -282,7 +282,7 @@ def _description(system: Model, work: Work) -> dict[str, Any]:
             for axis in work.grid.axes
         ],
         "parameters": parameters,
-        "texts": dict(system.origin.digests),
+        "texts": dict(model.origin.digests),
         "model": hashlib.sha256(work.model).hexdigest(),
         "part_points": work.part_points,
         "versions": dict(program_versions()),

@@ -50,17 +50,17 @@ class Locus:
 
 
 @part("locus")
-def root_locus(system: Model, critical: Critical) -> Locus:
+def root_locus(model: Model, critical: Critical) -> Locus:
     """Return the eigenvalues of a model over the range of a search for critical values.
 
     Parameters
     ----------
-    system
+    model
         The compiled model, with all other parameters fixed.
     critical
         The critical values of the parameter that is varied.
     """
-    parameter_ref = find(system, critical.parameter, counts=True)
+    parameter_ref = find(model, critical.parameter, counts=True)
     low, high = critical.searched_to
     most = max(
         [
@@ -73,7 +73,7 @@ def root_locus(system: Model, critical: Critical) -> Locus:
     values = np.linspace(low, high, POINTS)
     if critical.counted:
         values = np.unique(np.round(values))
-    numeric = numeric_model(system)
+    numeric = numeric_model(model)
     analysis = analyze(numeric)
     now = np.array([mode.eigenvalue for mode in analysis.modes])
     indices, eigenvalues = eigenvalues_at(numeric, parameter_ref, values.tolist())

@@ -125,9 +125,9 @@ def sensitivities(numeric: NumericModel, *, analysis: Analysis | None = None) ->
     -----
     A parameter of 0 is varied separately: a mode that is rigid at this value is not rigid when it varies.
     """
-    system = numeric.model
-    with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
-        parameter_refs = varied(system)
+    model = numeric.model
+    with single_threaded(), finite_equations(model.origin.topology), np.errstate(all="ignore"):
+        parameter_refs = varied(model)
         start = prepare_at_start(numeric, parameter_refs)
         now = analysis or analyze(numeric)
         if start is None:
@@ -146,7 +146,7 @@ def sensitivities(numeric: NumericModel, *, analysis: Analysis | None = None) ->
             return any(np.abs(cluster.values).max() > largest for cluster in clusters_of(*parameters) or ())
 
         zero_parameters = [
-            parameter_ref for parameter_ref in parameter_refs if not parameter_of(system, parameter_ref).value
+            parameter_ref for parameter_ref in parameter_refs if not parameter_of(model, parameter_ref).value
         ]
         nonzero = [parameter_ref for parameter_ref in parameter_refs if parameter_ref not in zero_parameters]
         breaking = [parameter_ref for parameter_ref in zero_parameters if breaks_rigid_mode(parameter_ref)]
@@ -177,7 +177,7 @@ def sensitivities(numeric: NumericModel, *, analysis: Analysis | None = None) ->
                     continue
                 for column, parameter in enumerate(parameters):
                     if cluster.still[column]:
-                        rows += _cluster_rows(system, parameter, cluster, column, first_rank)
+                        rows += _cluster_rows(model, parameter, cluster, column, first_rank)
                     else:
                         excluded.append(parameter.label)
                 first_rank += len(cluster.values)
@@ -206,18 +206,18 @@ def sensitivities(numeric: NumericModel, *, analysis: Analysis | None = None) ->
     return Sensitivities(radius, active, tuple(rows), "; ".join(notes))
 
 
-def varied(system: Model) -> list[ParameterRef]:
+def varied(model: Model) -> list[ParameterRef]:
     """Return the free parameters that vary continuously.
 
     Start values and parameters of unreliable links are left out.
     """
-    starts = {state.start for peer_type in system.peer_types for state in peer_type.states}
+    starts = {state.start for peer_type in model.peer_types for state in peer_type.states}
     starts |= {
-        start for peer_type in system.peer_types for clock in peer_type.clocks for start in clock.starts
+        start for peer_type in model.peer_types for clock in peer_type.clocks for start in clock.starts
     }
-    excluded = starts | channel_numbers(system)
-    excluded |= {parameter.name for parameter in system.parameters if parameter.choices}
-    return [parameter_ref for parameter_ref in free_parameters(system) if parameter_ref.name not in excluded]
+    excluded = starts | channel_numbers(model)
+    excluded |= {parameter.name for parameter in model.parameters if parameter.choices}
+    return [parameter_ref for parameter_ref in free_parameters(model) if parameter_ref.name not in excluded]
 
 
 def _by_analyses(
@@ -247,18 +247,18 @@ def network_sensitivities(numeric: NumericModel) -> Sensitivities:
     numeric
         The model with its parameter values.
     """
-    system = numeric.model
+    model = numeric.model
     with (
         part("sensitivities"),
         single_threaded(),
-        finite_equations(system.origin.topology),
+        finite_equations(model.origin.topology),
         np.errstate(all="ignore"),
     ):
         from apc.mean_square.mean_square_stability import (
             mean_square_growth,  # most models have an ideal network
         )
 
-        parameter_refs = [*varied(system), *channel_parameters(system)]
+        parameter_refs = [*varied(model), *channel_parameters(model)]
         growth = mean_square_growth(numeric)
         if reason := not_varied(len(parameter_refs), growth):
             return Sensitivities(0.0, (), (), f"sensitivities not computed: {reason}")
@@ -284,17 +284,17 @@ def _finite_differences(
     radius, active
         The radius at the present values, and its eigenvalues with the names of their systems.
     """
-    system = numeric.model
-    channels = channel_numbers(system)
+    model = numeric.model
+    channels = channel_numbers(model)
     together = [parameter_ref for parameter_ref in parameter_refs if parameter_ref.name not in channels]
     rates = dict(zip(together, _rates_of_change(numeric, together, criterion), strict=True))
     rows, not_differentiated = [], []
     for parameter_ref in parameter_refs:
-        present = value_now(system, parameter_ref)
+        present = value_now(model, parameter_ref)
         if parameter_ref not in rates:
             (rates[parameter_ref],) = _rates_of_change(numeric, [parameter_ref], criterion)
         if math.isfinite(rate := rates[parameter_ref]):
-            unit = unit_of(system, parameter_ref.name)
+            unit = unit_of(model, parameter_ref.name)
             rows.append(Sensitivity(parameter_ref.label, unit, present, rate, rate * present, 0))
         else:
             not_differentiated.append(parameter_ref.label)
@@ -341,18 +341,18 @@ def not_varied(count: int, growth: StabilityMeasure) -> str:
     return ""
 
 
-def channel_parameters(system: Model) -> list[ParameterRef]:
+def channel_parameters(model: Model) -> list[ParameterRef]:
     """Return the independent loss and jitter parameters of links.
 
     Of a link with independent losses, `loss: 2 %`, the probabilities of bursts are left out.
     """
-    holder, numbers = scope_of(system).holder, set(channel_numbers(system))
-    for loss in (channel.loss for link in system.links for channel in link.channels):
+    holder, numbers = scope_of(model).holder, set(channel_numbers(model))
+    for loss in (channel.loss for link in model.links for channel in link.channels):
         if loss is not None and holder[loss.r].formula is not None:
             numbers -= {loss.one_minus_h, loss.one_minus_k}
-    times = [ParameterRef(timing.name) for timing in named_times(system) if timing.formula is None]
+    times = [ParameterRef(timing.name) for timing in named_times(model) if timing.formula is None]
     return [
-        parameter_ref for parameter_ref in (*free_parameters(system), *times) if parameter_ref.name in numbers
+        parameter_ref for parameter_ref in (*free_parameters(model), *times) if parameter_ref.name in numbers
     ]
 
 
@@ -372,14 +372,14 @@ class _Cluster:
 
 
 def _cluster_rows(
-    system: Model, parameter_ref: ParameterRef, cluster: _Cluster, column: int, first_rank: int
+    model: Model, parameter_ref: ParameterRef, cluster: _Cluster, column: int, first_rank: int
 ) -> list[Sensitivity]:
     """Return the sensitivities of a cluster's magnitudes to one parameter, the largest first.
 
     `column` is the index of the parameter in the cluster's derivatives, `first_rank` the number of
     eigenvalues before the cluster.
     """
-    parameter = parameter_of(system, parameter_ref)
+    parameter = parameter_of(model, parameter_ref)
     derivatives = np.linalg.eigvals(cluster.rates[column])
     growth = np.sort((cluster.values.conj() * derivatives).real / np.abs(cluster.values))[::-1]
     return [

@@ -58,13 +58,13 @@ SHARES = 33
 
 
 def criterion_of(
-    system: Model, requested: str | None, location: SourceLocation, varied: Sequence[ParameterRef] = ()
+    model: Model, requested: str | None, location: SourceLocation, varied: Sequence[ParameterRef] = ()
 ) -> str:
     """Return the criterion of a verdict: the named one, or by default mean square if a link is unreliable.
 
     Parameters
     ----------
-    system
+    model
         The compiled model.
     requested
         "mean-square", "nominal", "passive", or None.
@@ -81,14 +81,14 @@ def criterion_of(
     if requested not in (None, MEAN_SQUARE, NOMINAL, PASSIVE):
         message = f"{str(requested)[:40]} is not a criterion (available: {MEAN_SQUARE}, {NOMINAL}, {PASSIVE})"
         raise ApcError(Diagnostic("E898", location, message, fix=f"--criterion {MEAN_SQUARE}"))
-    by_chance = unreliable(system) or any(
-        parameter_ref.name in channel_numbers(system) for parameter_ref in varied
+    by_chance = unreliable(model) or any(
+        parameter_ref.name in channel_numbers(model) for parameter_ref in varied
     )
     return requested or (MEAN_SQUARE if by_chance else NOMINAL)
 
 
 def refuse_timing_parameter(
-    system: Model, parameter_ref: ParameterRef, location: SourceLocation, criterion: str = MEAN_SQUARE
+    model: Model, parameter_ref: ParameterRef, location: SourceLocation, criterion: str = MEAN_SQUARE
 ) -> None:
     """Raise an error for a parameter that cannot be varied under a scalar criterion.
 
@@ -97,7 +97,7 @@ def refuse_timing_parameter(
 
     Parameters
     ----------
-    system, parameter_ref
+    model, parameter_ref
         The compiled model and the parameter to vary.
     location
         The location of the request.
@@ -109,8 +109,8 @@ def refuse_timing_parameter(
     ApcError
         E898 a timing parameter; E930 the same, or a channel parameter, with passive hands.
     """
-    jitter = {channel.jitter for link in system.links for channel in link.channels}
-    if reaches_time(system, parameter_ref) and parameter_ref.name not in jitter:
+    jitter = {channel.jitter for link in model.links for channel in link.channels}
+    if reaches_time(model, parameter_ref) and parameter_ref.name not in jitter:
         message = (
             f"{parameter_ref.label} can't be varied {SCALAR_CRITERIA[criterion]}, "
             "as it changes the order of events"
@@ -119,7 +119,7 @@ def refuse_timing_parameter(
             advice = f'analyze single values: apc analyze --hands passive --set {parameter_ref.label}="…"'
             raise ApcError(Diagnostic("E930", location, message, advice=advice))
         raise ApcError(Diagnostic("E898", location, message, fix=f"--criterion {NOMINAL}"))
-    if criterion == PASSIVE and parameter_ref.name in channel_numbers(system):
+    if criterion == PASSIVE and parameter_ref.name in channel_numbers(model):
         message = f"{parameter_ref.label} has no effect with passive hands, where all delays are nominal"
         raise ApcError(
             Diagnostic("E930", location, message, advice=f"use --criterion {MEAN_SQUARE} without --hands")
@@ -207,13 +207,13 @@ class RadiusEvaluator:
     criterion: str = MEAN_SQUARE
 
     @property
-    def system(self) -> Model:
+    def model(self) -> Model:
         """The compiled model."""
         return self.numeric.model
 
     def verdict(self, value: Sequence[float], *, bounded: bool = False) -> Verdict:
         """Return the verdict at a point (m,); undecided if the point has no value."""
-        overrides = overrides_at(self.system, self.free, value)
+        overrides = overrides_at(self.model, self.free, value)
         try:
             return verdict_with(
                 self.numeric, overrides, self.location, bounded=bounded, criterion=self.criterion
@@ -231,7 +231,7 @@ class RadiusEvaluator:
         if self.criterion != NOMINAL:
             return self.verdict(value)
         try:
-            numeric = self.numeric.at(apply(self.system, overrides_at(self.system, self.free, value)))
+            numeric = self.numeric.at(apply(self.model, overrides_at(self.model, self.free, value)))
             radius = determinant_radius(numeric)
         except ApcError:
             return OPEN
@@ -244,7 +244,7 @@ class RadiusEvaluator:
         if self.criterion != NOMINAL:
             return complex(self.matrices(np.array([value]))[0].item())
         return dominant_in_floats(
-            self.numeric.at(apply(self.system, overrides_at(self.system, self.free, value)))
+            self.numeric.at(apply(self.model, overrides_at(self.model, self.free, value)))
         )
 
     def parts(self, value: Sequence[float]) -> list[float]:
@@ -253,9 +253,9 @@ class RadiusEvaluator:
             return self.matrices(np.array([value]))[0].ravel().tolist()
         from apc.haptics.absolute_stability import loop_growths
 
-        overrides = overrides_at(self.system, self.free, value)
+        overrides = overrides_at(self.model, self.free, value)
         try:
-            growths = loop_growths(self.numeric.at(apply(self.system, overrides)), bounded=False)
+            growths = loop_growths(self.numeric.at(apply(self.model, overrides)), bounded=False)
         except ApcError as error:
             if error.mistakes[0].code not in NOWHERE:
                 raise
@@ -285,7 +285,7 @@ class RadiusEvaluator:
         """Return the mask of the values (k, m) that are within the bounds of each parameter."""
         result = np.ones(len(values), dtype=bool)
         for column, parameter_ref in zip(values.T, self.free, strict=True):
-            lowest, highest = allowed(self.system, parameter_ref)
+            lowest, highest = allowed(self.model, parameter_ref)
             result &= (column >= lowest) & (column <= highest)
         return result
 
@@ -298,11 +298,11 @@ class RadiusEvaluator:
         return (np.array(errors)[:, None, None],)
 
 
-def allowed(system: Model, parameter_ref: ParameterRef) -> tuple[float, float]:
+def allowed(model: Model, parameter_ref: ParameterRef) -> tuple[float, float]:
     """Return the lowest and highest allowed value of a parameter or timing, infinite without a bound."""
-    if any(timing.name == parameter_ref.name for timing in system.timings):
+    if any(timing.name == parameter_ref.name for timing in model.timings):
         return 0.0, math.inf
-    parameter = parameter_of(system, parameter_ref)
+    parameter = parameter_of(model, parameter_ref)
     return (
         -math.inf if parameter.minimum is None else parameter.minimum,
         math.inf if parameter.maximum is None else parameter.maximum,
@@ -350,23 +350,23 @@ class PointwisePath(SingleSegment):
         )
 
 
-def scale_of(system: Model, parameter_ref: ParameterRef) -> float:
+def scale_of(model: Model, parameter_ref: ParameterRef) -> float:
     """Return the value of a parameter; for 0, the largest magnitude of a parameter of its unit, else 1."""
-    if present := value_now(system, parameter_ref):
+    if present := value_now(model, parameter_ref):
         return present
-    unit = unit_of(system, parameter_ref.name)
-    others = (parameter for parameter in system.parameters if parameter.unit == unit)
+    unit = unit_of(model, parameter_ref.name)
+    others = (parameter for parameter in model.parameters if parameter.unit == unit)
     return max((abs(parameter.value) for parameter in others), default=0.0) or 1.0
 
 
 def line_points(
-    system: Model, parameter_ref: ParameterRef, low: float | None, high: float | None, scale: float
+    model: Model, parameter_ref: ParameterRef, low: float | None, high: float | None, scale: float
 ) -> tuple[Floats, float]:
     """Return the first samples along a parameter, and the value below which cells no longer become narrower.
 
     Parameters
     ----------
-    system, parameter_ref
+    model, parameter_ref
         The compiled model and the parameter that varies.
     low, high
         The range; by default, for a probability 0 (or one sample, where 0 is excluded) to one sample
@@ -375,14 +375,14 @@ def line_points(
     scale
         The present value, or a substitute for 0.
     """
-    if unit_of(system, parameter_ref.name) == "1" and parameter_ref.name in channel_numbers(system):
+    if unit_of(model, parameter_ref.name) == "1" and parameter_ref.name in channel_numbers(model):
         # Endless bursts (r = 0) have no stationary distribution, and a loss of 1 delivers no packet.
-        channels = [channel for link in system.links for channel in link.channels]
+        channels = [channel for link in model.links for channel in link.channels]
         endless = {channel.loss.r for channel in channels if channel.loss}
         least = 1 / SHARES if parameter_ref.name in endless else 0.0
         start, end = low if low is not None else least, high if high is not None else 1 - 1 / SHARES
         return np.linspace(start, end, SHARES), 1 / SHARES
-    least, highest = allowed(system, parameter_ref)
+    least, highest = allowed(model, parameter_ref)
     start = low if low is not None else max(least, 0.0 if scale > 0 else SPAN * scale)
     end = high if high is not None else min(SPAN * max(abs(scale), abs(start)), highest)
     return spread(start, end, abs(scale)), abs(scale) / SPAN

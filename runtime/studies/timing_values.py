@@ -38,50 +38,50 @@ RATES = ("Hz", "1/s")
 DIGITS, CACHE_SIZE = 9, 256
 
 
-def system_with_delay(system: Model, parameter_ref: ParameterRef, value: Fraction) -> Model:
+def system_with_delay(model: Model, parameter_ref: ParameterRef, value: Fraction) -> Model:
     """Return the model with another value of the timing or of the parameter that affects timings."""
-    return apply(system, [Override(parameter_ref, value)])
+    return apply(model, [Override(parameter_ref, value)])
 
 
-def delay_now(system: Model, parameter_ref: ParameterRef) -> Fraction:
+def delay_now(model: Model, parameter_ref: ParameterRef) -> Fraction:
     """Return the present value of a timing, or of a parameter that affects timings, exactly."""
-    for timing in system.timings:
+    for timing in model.timings:
         if timing.name == parameter_ref.name:
             return timing.value
-    return next(parameter.number for parameter in system.parameters if parameter.name == parameter_ref.name)
+    return next(parameter.number for parameter in model.parameters if parameter.name == parameter_ref.name)
 
 
 @lru_cache(maxsize=CACHE_SIZE)
-def timing_slopes(system: Model, parameter_ref: ParameterRef) -> Mapping[str, Fraction]:
+def timing_slopes(model: Model, parameter_ref: ParameterRef) -> Mapping[str, Fraction]:
     """Return the slope of each timing with respect to a parameter or timing, by its name."""
-    now = delay_now(system, parameter_ref)
+    now = delay_now(model, parameter_ref)
     now_timings, shifted_timings = (
-        resolve(system_with_delay(system, parameter_ref, value)).timings for value in (now, now + STEP)
+        resolve(system_with_delay(model, parameter_ref, value)).timings for value in (now, now + STEP)
     )
     return {name: (shifted_timings[name] - now_timings[name]) / STEP for name in now_timings}
 
 
-def _clock_times(system: Model, *, phases: bool) -> set[str]:
+def _clock_times(model: Model, *, phases: bool) -> set[str]:
     """Return the names of the phases, or of the periods, of all clocks."""
-    return {clock.phase if phases else clock.period for clock in system.clocks}
+    return {clock.phase if phases else clock.period for clock in model.clocks}
 
 
-def reaches_period(system: Model, parameter_ref: ParameterRef) -> bool:
+def reaches_period(model: Model, parameter_ref: ParameterRef) -> bool:
     """Return whether the period of some clock is, or depends on, this parameter."""
-    return _affects_times(system, parameter_ref, _clock_times(system, phases=False))
+    return _affects_times(model, parameter_ref, _clock_times(model, phases=False))
 
 
-def _affects_times(system: Model, parameter_ref: ParameterRef, times: set[str]) -> bool:
+def _affects_times(model: Model, parameter_ref: ParameterRef, times: set[str]) -> bool:
     """Return whether a parameter is one of these times, or affects one."""
-    return parameter_ref.name in times or parameter_ref.name in scope_of(system).needed(sorted(times))
+    return parameter_ref.name in times or parameter_ref.name in scope_of(model).needed(sorted(times))
 
 
 def refuse_phase(
-    system: Model, parameter_ref: ParameterRef, location: SourceLocation, *, code: str = "E844"
+    model: Model, parameter_ref: ParameterRef, location: SourceLocation, *, code: str = "E844"
 ) -> None:
     """Raise an error E844, or another code, for a number that affects the phase of a clock but no period."""
-    if _affects_times(system, parameter_ref, _clock_times(system, phases=True)) and not reaches_period(
-        system, parameter_ref
+    if _affects_times(model, parameter_ref, _clock_times(model, phases=True)) and not reaches_period(
+        model, parameter_ref
     ):
         message = f"{parameter_ref.name} sets the phase of a clock: it can't be varied continuously"
         raise ApcError(
@@ -89,30 +89,30 @@ def refuse_phase(
         )
 
 
-def is_scaled(system: Model, parameter_ref: ParameterRef, *, delays: bool = False) -> bool:
+def is_scaled(model: Model, parameter_ref: ParameterRef, *, delays: bool = False) -> bool:
     """Return whether the ratios of all periods and phases are the same at every value of a number.
 
     With `delays`, those of the delays, too.
     """
-    now, timings = delay_now(system, parameter_ref), resolve(system).timings
-    names = _clock_times(system, phases=False) | _clock_times(system, phases=True)
-    first = system.clocks[0].period
+    now, timings = delay_now(model, parameter_ref), resolve(model).timings
+    names = _clock_times(model, phases=False) | _clock_times(model, phases=True)
+    first = model.clocks[0].period
     for value in (2 * now, now + STEP):
-        changed = resolve(system_with_delay(system, parameter_ref, value)).timings
+        changed = resolve(system_with_delay(model, parameter_ref, value)).timings
         factor = changed[first] / timings[first]
         if any(changed[name] != factor * timings[name] for name in (timings if delays else names)):
             return False
     return True
 
 
-def _frame_ticks(system: Model, parameter_ref: ParameterRef, value: Fraction) -> float:
+def _frame_ticks(model: Model, parameter_ref: ParameterRef, value: Fraction) -> float:
     """Return the number of ticks of all clocks in a frame at a value, infinite without a frame."""
     try:
-        timings = resolve(system_with_delay(system, parameter_ref, value)).timings
+        timings = resolve(system_with_delay(model, parameter_ref, value)).timings
     except ApcError:  # beyond the bounds of the number
         return math.inf
-    used = clocks_in_use(system)
-    periods = [timings[clock.period] for clock in system.clocks if clock.name in used]
+    used = clocks_in_use(model)
+    periods = [timings[clock.period] for clock in model.clocks if clock.name in used]
     if not all(period > 0 for period in periods):
         return math.inf
     frame = common_multiple(periods)
@@ -129,28 +129,28 @@ def _simplest_fraction(low: Fraction, high: Fraction) -> Fraction:
     return whole + 1 / _simplest_fraction(1 / (high - whole), 1 / (low - whole))
 
 
-def base_value(system: Model, parameter_ref: ParameterRef) -> Fraction:
+def base_value(model: Model, parameter_ref: ParameterRef) -> Fraction:
     """Return the value in SI whose multiples by simple fractions lead to short frames.
 
     It is the common divisor of the constant periods for a time, its inverse for a rate, 1 for another number,
     and the present value if there is no constant period.
     """
-    slopes, timings = timing_slopes(system, parameter_ref), resolve(system).timings
-    fixed = [timings[name] for name in _clock_times(system, phases=False) if not slopes[name]]
+    slopes, timings = timing_slopes(model, parameter_ref), resolve(model).timings
+    fixed = [timings[name] for name in _clock_times(model, phases=False) if not slopes[name]]
     if not fixed:
-        return delay_now(system, parameter_ref)
-    unit, divisor = unit_of(system, parameter_ref.name), common_divisor(fixed)
+        return delay_now(model, parameter_ref)
+    unit, divisor = unit_of(model, parameter_ref.name), common_divisor(fixed)
     return divisor if unit == "s" else 1 / divisor if unit in RATES else Fraction(1)
 
 
 def period_between(
-    system: Model, parameter_ref: ParameterRef, unit: Fraction, low: Fraction, high: Fraction
+    model: Model, parameter_ref: ParameterRef, unit: Fraction, low: Fraction, high: Fraction
 ) -> Fraction | None:
     """Return the simplest value strictly between two, None if its frame is too long.
 
     Parameters
     ----------
-    system, parameter_ref
+    model, parameter_ref
         The compiled model and the number that varies.
     unit
         The value from `base_value`.
@@ -158,11 +158,11 @@ def period_between(
         The two values in SI.
     """
     value = unit * _simplest_fraction(low / unit, high / unit)
-    return value if _frame_ticks(system, parameter_ref, value) <= MOST_FRAME_TICKS else None
+    return value if _frame_ticks(model, parameter_ref, value) <= MOST_FRAME_TICKS else None
 
 
 def long_period_between(
-    system: Model,
+    model: Model,
     parameter_ref: ParameterRef,
     unit: Fraction,
     low: Fraction,
@@ -175,40 +175,40 @@ def long_period_between(
 
     Parameters
     ----------
-    system, parameter_ref, unit, low, high
+    model, parameter_ref, unit, low, high
         As for `period_between`.
     """
     middle = (low + high) / 2
     trial = unit * Fraction(round(TRIAL * middle / unit) or 1, TRIAL)
-    largest_denominator = TRIAL * MOST_FRAME_TICKS / _frame_ticks(system, parameter_ref, trial)
+    largest_denominator = TRIAL * MOST_FRAME_TICKS / _frame_ticks(model, parameter_ref, trial)
     if not math.isfinite(largest_denominator):
         return None
     for denominator in range(int(largest_denominator), max(int(largest_denominator / 2), 1), -1):
         numerator = round(denominator * middle / unit)
         value = unit * Fraction(numerator, denominator)
         if math.gcd(numerator, denominator) == 1 and low < value < high:
-            return value if _frame_ticks(system, parameter_ref, value) <= MOST_FRAME_TICKS else None
+            return value if _frame_ticks(model, parameter_ref, value) <= MOST_FRAME_TICKS else None
     return None
 
 
 @lru_cache(maxsize=CACHE_SIZE)
-def nearest_period(system: Model, parameter_ref: ParameterRef, value: Fraction) -> Fraction:
+def nearest_period(model: Model, parameter_ref: ParameterRef, value: Fraction) -> Fraction:
     """Return the nearest period with a short frame, to as many digits as possible; other times unchanged."""
-    if value <= 0 or not reaches_period(system, parameter_ref) or is_scaled(system, parameter_ref):
+    if value <= 0 or not reaches_period(model, parameter_ref) or is_scaled(model, parameter_ref):
         return value
-    if _frame_ticks(system, parameter_ref, value) <= MOST_FRAME_TICKS:
+    if _frame_ticks(model, parameter_ref, value) <= MOST_FRAME_TICKS:
         return value
-    unit = base_value(system, parameter_ref)
+    unit = base_value(model, parameter_ref)
     for digits in range(DIGITS, 0, -1):
         error_bound = value / 10**digits
-        near = period_between(system, parameter_ref, unit, value - error_bound, value + error_bound)
+        near = period_between(model, parameter_ref, unit, value - error_bound, value + error_bound)
         if near is not None:
             return near
     return value
 
 
 def periods_near(
-    system: Model, parameter_ref: ParameterRef, targets: Sequence[Fraction], location: SourceLocation
+    model: Model, parameter_ref: ParameterRef, targets: Sequence[Fraction], location: SourceLocation
 ) -> list[Fraction]:
     """Return values of a period or rate near some values, ascending, each with a frame of allowed length.
 
@@ -219,7 +219,7 @@ def periods_near(
 
     Parameters
     ----------
-    system, parameter_ref
+    model, parameter_ref
         The compiled model and the number that varies.
     targets
         The values in ascending order, in SI.
@@ -231,27 +231,27 @@ def periods_near(
     ApcError
         E844 fewer than two periods have a frame of at most `MOST_FRAME_TICKS` ticks.
     """
-    unit = base_value(system, parameter_ref)
+    unit = base_value(model, parameter_ref)
     periods = {
         value
         for value in (targets[0], targets[-1])
-        if _frame_ticks(system, parameter_ref, value) <= MOST_FRAME_TICKS
+        if _frame_ticks(model, parameter_ref, value) <= MOST_FRAME_TICKS
     }
     for before, value, after in zip(targets, targets[1:], targets[2:], strict=False):
         low, high = value - (value - before) / 3, value + (after - value) / 3
-        near = period_between(system, parameter_ref, unit, low, high)
+        near = period_between(model, parameter_ref, unit, low, high)
         if near is None:
             continue
         periods.add(near)
         for end in (low, high):  # on both sides of it, as near as possible
             for share in SHARES:
                 ends = sorted((near, near + (end - near) * share))
-                long_period = long_period_between(system, parameter_ref, unit, *ends)
+                long_period = long_period_between(model, parameter_ref, unit, *ends)
                 if long_period is not None:
                     periods.add(long_period)
                     break
     if len(periods) < 2:
-        si_unit = str(unit_of(system, parameter_ref.name))
+        si_unit = str(unit_of(model, parameter_ref.name))
         span = " to ".join(with_unit(f"{float(end):g}", si_unit) for end in (targets[0], targets[-1]))
         message = (
             f"values of {parameter_ref.label} from {span} lead to frames of more than "

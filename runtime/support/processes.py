@@ -240,14 +240,14 @@ def _compute(task: Any) -> Any:
         return compute(shared, task)
 
 
-def model_bytes(system: Model) -> bytes:
+def model_bytes(model: Model) -> bytes:
     """Return a compiled model as bytes for another process of this program."""
-    return store.encoded(system)
+    return store.encoded(model)
 
 
-def digest_of(system: Model) -> bytes:
+def digest_of(model: Model) -> bytes:
     """Return the SHA-256 of a compiled model with its numbers."""
-    return hashlib.sha256(store.model_of(system)).digest()
+    return hashlib.sha256(store.model_of(model)).digest()
 
 
 def model_of_bytes(model: bytes) -> Model:

@@ -87,18 +87,18 @@ class CommunicationGraph:
         return f"{name}[{peer - int(self.starts[self.groups.index(name)]) + 1}]"
 
 
-def build_exchange(system: Model, timings: Mapping[str, Fraction]) -> CommunicationGraph:
+def build_exchange(model: Model, timings: Mapping[str, Fraction]) -> CommunicationGraph:
     """Return the communication graph of a model; delays of equal value, channel and clock are one timing.
 
     Parameters
     ----------
-    system
+    model
         The compiled model.
     timings
         Seconds by the name of the timing.
     """
-    groups = tuple((group.name, group.count) for group in system.groups)
-    return _cached_graph(system.origin.topology, groups, system.links, tuple(timings.items()))
+    groups = tuple((group.name, group.count) for group in model.groups)
+    return _cached_graph(model.origin.topology, groups, model.links, tuple(timings.items()))
 
 
 @functools.lru_cache(maxsize=CACHE_SIZE)

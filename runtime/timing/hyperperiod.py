@@ -53,7 +53,7 @@ class Times:
 
 
 def times_in_use(
-    system: Model,
+    model: Model,
     timings: Mapping[str, Fraction],
     patterns: Sequence[LinearSubsystem],
     live: Sequence[frozenset[tuple[int, int]]],
@@ -63,7 +63,7 @@ def times_in_use(
 
     Parameters
     ----------
-    system, timings
+    model, timings
         The compiled model, and seconds by the name of the timing.
     patterns, live
         The structural pattern of each peer type, and its live outputs (see `liveness`).
@@ -75,8 +75,8 @@ def times_in_use(
     ApcError
         E805 too many ticks in a frame, E809 a delay below zero.
     """
-    clock_of = {clock.name: clock for clock in system.clocks}
-    link_of = {link.name: link for link in system.links}
+    clock_of = {clock.name: clock for clock in model.clocks}
+    link_of = {link.name: link for link in model.links}
     clocks: dict[str, Clock] = {}
     delays: dict[str, Fraction] = {}
     for pattern, outputs in zip(patterns, live, strict=True):
@@ -94,11 +94,11 @@ def times_in_use(
         delays[coupling_term.delay] = timings[coupling_term.delay]
     for name, delay in delays.items():
         if delay < 0:
-            formulas = (timing.formula for timing in system.timings if timing.name == name)
+            formulas = (timing.formula for timing in model.timings if timing.name == name)
             formula, got = next(formulas, None), f"{1000 * float(delay):g} ms"
             shown = f"delay {formula.text} of a hold" if formula and name.startswith("delay of ") else name
             raise ApcError(
-                Diagnostic("E809", SourceLocation(system.origin.topology), shown, "0 ms or more", got)
+                Diagnostic("E809", SourceLocation(model.origin.topology), shown, "0 ms or more", got)
             )
     if not clocks:  # nothing is sampled: any frame will do
         clocks = dict(clock_of) or {"": Clock("", "", "")}
@@ -109,7 +109,7 @@ def times_in_use(
     quantum = common_divisor([*period.values(), *phase.values(), *delays.values()])
     period_quanta = {name: int(value / quantum) for name, value in period.items()}
     frame = int(common_multiple(period.values()) / quantum)
-    _check_frame_length(system, period, period_quanta, frame, quantum)
+    _check_frame_length(model, period, period_quanta, frame, quantum)
     return Times(
         quantum=quantum,
         frame=frame,
@@ -119,7 +119,7 @@ def times_in_use(
 
 
 def _check_frame_length(
-    system: Model,
+    model: Model,
     period: Mapping[str, Fraction],
     period_quanta: Mapping[str, int],
     frame: int,
@@ -129,7 +129,7 @@ def _check_frame_length(
 
     Parameters
     ----------
-    system
+    model
         The compiled model.
     period, period_quanta
         The period of each clock in seconds, and in quanta.
@@ -144,17 +144,17 @@ def _check_frame_length(
             f"{ticks:,} ticks; the limit is {MOST_TICKS:,}"
         )
         fix, advice = "", "use periods that are simple multiples of each other"
-        odd = max(system.clocks, key=lambda clock: period.get(clock.name, Fraction(0)).denominator)
+        odd = max(model.clocks, key=lambda clock: period.get(clock.name, Fraction(0)).denominator)
         if frame == max(period_quanta.values()) and (fits := _fastest_that_fits(period_quanta, frame)):
             fastest = min(period_quanta, key=lambda name: period_quanta[name])
-            odd = next(clock for clock in system.clocks if clock.name == fastest)
+            odd = next(clock for clock in model.clocks if clock.name == fastest)
             periods = (1000 * frame * quantum / ticks for ticks in fits)
             short = (f"{float(ms):g} ms" for ms in periods if Fraction(f"{float(ms):.3g}") == ms)
             fix = f"{fastest}: {next(short, f'{frame * quantum / fits[0]} s')}"
             advice = ""
         elif period.get(odd.name) and (ms := _rounded(period, odd.name)):
             fix, advice = f"{odd.name}: {ms} ms", ""
-        location = SourceLocation(system.origin.topology, odd.line, odd.column)
+        location = SourceLocation(model.origin.topology, odd.line, odd.column)
         raise ApcError(Diagnostic("E805", location, message, fix=fix, advice=advice))
 
 

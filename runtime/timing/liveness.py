@@ -64,7 +64,7 @@ ReceptionPattern = tuple[tuple[tuple[tuple[CouplingTerm, str], ...], ...], ...]
 
 
 def reception_of(
-    system: Model,
+    model: Model,
     patterns: Sequence[LinearSubsystem],
     exchange: CommunicationGraph,
     group: int,
@@ -76,7 +76,7 @@ def reception_of(
 
     Parameters
     ----------
-    system, exchange
+    model, exchange
         The compiled model and its communication graph.
     patterns, read
         The structural pattern of each peer type, and its live receives (see `liveness`).
@@ -88,18 +88,18 @@ def reception_of(
     ApcError
         E801 a mean, maximum or minimum over no peers.
     """
-    pattern = patterns[system.groups[group].peer_type]
+    pattern = patterns[model.groups[group].peer_type]
     partitions: list[tuple[tuple[tuple[CouplingTerm, str], ...], ...]] = []
     for p, (partition, tick) in enumerate(zip(pattern.peer_type.clocks, pattern.ticks, strict=True)):
         receives: list[tuple[tuple[CouplingTerm, str], ...]] = []
         for index, (receive, channels) in enumerate(zip(partition.receives, tick.channels, strict=True)):
-            if (p, index) not in read[system.groups[group].peer_type] or not channels:
+            if (p, index) not in read[model.groups[group].peer_type] or not channels:
                 receives.append(())
                 continue
-            names = _channels(system, group, receive.link)
+            names = _channels(model, group, receive.link)
             is_sending = [
-                any(send.link == receive.link for send in system.peer_types[sender.peer_type].sends)
-                for sender in system.groups
+                any(send.link == receive.link for send in model.peer_types[sender.peer_type].sends)
+                for sender in model.groups
             ]
             senders = exchange.receives(receive.link, group, is_sending)
             if not senders and receive.operator != "sum":
@@ -126,10 +126,10 @@ def reception_of(
     return tuple(partitions)
 
 
-def _channels(system: Model, group: int, link: str) -> tuple[str, ...]:
+def _channels(model: Model, group: int, link: str) -> tuple[str, ...]:
     """Return the names of a link's channels as the group's peer type sends them, else as the first type
     that sends.
     """
-    own_type = system.groups[group].peer_type
-    peer_types = [system.peer_types[own_type], *system.peer_types]
+    own_type = model.groups[group].peer_type
+    peer_types = [model.peer_types[own_type], *model.peer_types]
     return next(send.channels for peer_type in peer_types for send in peer_type.sends if send.link == link)

@@ -63,7 +63,7 @@ _Receptions = dict[tuple[int, int], tuple[tuple[ReceivedSample | UncertainSample
 
 
 def build_schedules(
-    system: Model,
+    model: Model,
     timings: Mapping[str, Fraction],
     patterns: Sequence[LinearSubsystem],
     *,
@@ -74,7 +74,7 @@ def build_schedules(
 
     Parameters
     ----------
-    system
+    model
         The compiled model.
     timings
         Seconds by the name of the timing.
@@ -96,15 +96,15 @@ def build_schedules(
     assert sorted(order) == sorted(ORDER), f"an order is a permutation of {ORDER}"
     return _schedules(
         _ScheduleKey(
-            clocks=system.clocks,
-            links=system.links,
-            peer_types=system.peer_types,
-            groups=tuple((group.name, group.count, group.peer_type) for group in system.groups),
+            clocks=model.clocks,
+            links=model.links,
+            peer_types=model.peer_types,
+            groups=tuple((group.name, group.count, group.peer_type) for group in model.groups),
             timings=tuple(timings.items()),
             order=tuple(order),
             stored=tuple((stored or {}).items()),
             known=tuple(map(id, patterns)),
-            system=system,
+            model=model,
             patterns=tuple(patterns),
         )
     )
@@ -126,31 +126,31 @@ class _ScheduleKey:
     order: tuple[str, ...]
     stored: tuple[tuple[str, int], ...]
     known: tuple[int, ...]
-    system: Model = field(compare=False)
+    model: Model = field(compare=False)
     patterns: tuple[LinearSubsystem, ...] = field(compare=False)
 
 
 @functools.lru_cache(maxsize=CACHE_SIZE)
 def _schedules(key: _ScheduleKey) -> tuple[Schedule, ...]:
     """Return the schedules of every group, cached (see `build_schedules`)."""
-    system, patterns, timings, order, stored = (
-        key.system,
+    model, patterns, timings, order, stored = (
+        key.model,
         key.patterns,
         dict(key.timings),
         key.order,
         dict(key.stored),
     )
     rank = {name: index for index, name in enumerate(order)}
-    exchange = build_exchange(system, timings)
+    exchange = build_exchange(model, timings)
     live = [live_outputs(pattern) for pattern in patterns]
     read = [live_receives(pattern, outputs) for pattern, outputs in zip(patterns, live, strict=True)]
-    reception = [reception_of(system, patterns, exchange, group, read) for group in range(len(system.groups))]
-    times = times_in_use(system, timings, patterns, live, reception)
+    reception = [reception_of(model, patterns, exchange, group, read) for group in range(len(model.groups))]
+    times = times_in_use(model, timings, patterns, live, reception)
 
-    _check_holds(system, patterns, live, times)
+    _check_holds(model, patterns, live, times)
     receptions: dict[tuple[int, ReceptionPattern], _Receptions] = {}
     depth: dict[SentSample, int] = {}
-    for group, group_reception in zip(system.groups, reception, strict=True):
+    for group, group_reception in zip(model.groups, reception, strict=True):
         if (group.peer_type, group_reception) not in receptions:
             received = _received_at_ticks(
                 patterns[group.peer_type],
@@ -170,21 +170,21 @@ def _schedules(key: _ScheduleKey) -> tuple[Schedule, ...]:
                     depth |= {term.sample(item.channel, k): stored[link.name] for k in range(slots)}
                 else:
                     depth[item.sent] = max(depth.get(item.sent, 0), item.lag)
-    _check_depth(system, depth)
+    _check_depth(model, depth)
     built = {
         (peer_type, group_reception): _build_schedule(
-            patterns[peer_type], system, live[peer_type], received, depth, times, rank
+            patterns[peer_type], model, live[peer_type], received, depth, times, rank
         )
         for (peer_type, group_reception), received in receptions.items()
     }
     return tuple(
         built[group.peer_type, group_reception]
-        for group, group_reception in zip(system.groups, reception, strict=True)
+        for group, group_reception in zip(model.groups, reception, strict=True)
     )
 
 
 def _check_holds(
-    system: Model,
+    model: Model,
     patterns: Sequence[LinearSubsystem],
     live: Sequence[frozenset[tuple[int, int]]],
     times: Times,
@@ -213,11 +213,11 @@ def _check_holds(
         most = no_more(seconds * left / held[longest], 3)
         fix = f"{longest.rpartition('.')[2]}: {most} s" if left > 0 else ""
         advice = "slow down the clock" if fix else "shorten the delays of all forces, or slow down the clock"
-        location = SourceLocation(system.origin.topology)
+        location = SourceLocation(model.origin.topology)
         raise ApcError(Diagnostic("E805", location, message, fix=fix, advice=advice))
 
 
-def _check_depth(system: Model, depth: Mapping[SentSample, int]) -> None:
+def _check_depth(model: Model, depth: Mapping[SentSample, int]) -> None:
     """Raise ApcError E805 for delays so long that the packets stored for a peer exceed the limit."""
     packets = sum(depth.values())
     if packets > MOST_PACKETS:
@@ -229,7 +229,7 @@ def _check_depth(system: Model, depth: Mapping[SentSample, int]) -> None:
         raise ApcError(
             Diagnostic(
                 "E805",
-                SourceLocation(system.origin.topology),
+                SourceLocation(model.origin.topology),
                 message,
                 advice="shorten the delay, or slow down the link clock",
             )
@@ -311,7 +311,7 @@ def newest(
 
 def _build_schedule(
     pattern: LinearSubsystem,
-    system: Model,
+    model: Model,
     live: frozenset[tuple[int, int]],
     received_at: _Receptions,
     depth: Mapping[SentSample, int],
@@ -322,7 +322,7 @@ def _build_schedule(
 
     Parameters
     ----------
-    pattern, system, live
+    pattern, model, live
         The structural pattern of the peer type, the model, and the live outputs.
     received_at
         The receptions of each receive at each tick.
@@ -332,8 +332,8 @@ def _build_schedule(
         All times in quanta, and the rank of each event type among coincident events.
     """
     peer_type = pattern.peer_type
-    clock_of = {link.name: link.clock for link in system.links}
-    after = {link.name for link in system.links if link.after}
+    clock_of = {link.name: link.clock for link in model.links}
+    after = {link.name for link in model.links if link.after}
     receptions = {item for row in received_at.values() for receive in row for item in receive}
     received = tuple(sorted(received for received in receptions if isinstance(received, ReceivedSample)))
     selected = tuple(sorted(selected for selected in receptions if isinstance(selected, UncertainSample)))

@@ -192,7 +192,7 @@ class TuningSpec:
 
 
 def read_tuning_spec(
-    system: Model,
+    model: Model,
     free: Sequence[str | NamedValues] = (),
     *,
     maximize: str = "",
@@ -205,7 +205,7 @@ def read_tuning_spec(
 
     Parameters
     ----------
-    system
+    model
         The model.
     free
         The gains, each as `NAME=LOW:HIGH`.
@@ -227,40 +227,40 @@ def read_tuning_spec(
         E995 no free parameter, or a free time or number of peers; E996 an unknown objective or demand; E842,
         and the errors of `parameter_ranges.parse_range`: an invalid range; E831 a parameter with two ranges.
     """
-    by_study = {key: [text for word, text in system.tune if word == key] for key, _ in system.tune}
+    by_study = {key: [text for word, text in model.tune if word == key] for key, _ in model.tune}
     free, over = free or by_study.get("free", []), over or by_study.get("over", [])
     constraint = constraint or by_study.get("subject", [])
     if not (maximize or minimize):
-        maximize, minimize = (dict(system.tune).get(key, "") for key in ("maximize", "minimize"))
+        maximize, minimize = (dict(model.tune).get(key, "") for key in ("maximize", "minimize"))
     if not free:
         raise ApcError(
             Diagnostic(
                 "E995",
                 FREE,
                 "no tunable parameter (--free)",
-                fix=f'--free "{proposed_range(system, maximize or minimize)}"',
+                fix=f'--free "{proposed_range(model, maximize or minimize)}"',
             )
         )
-    gains = [_parse_gain(system, text) for text in free]
-    scenario_ranges = given_ranges(system, [_parse_range(system, text, OVER) for text in over])
+    gains = [_parse_gain(model, text) for text in free]
+    scenario_ranges = given_ranges(model, [_parse_range(model, text, OVER) for text in over])
     for index, gain in enumerate((*gains, *scenario_ranges)):
-        if any(overlap(system, earlier.free, gain.free) for earlier in (*gains, *scenario_ranges)[:index]):
+        if any(overlap(model, earlier.free, gain.free) for earlier in (*gains, *scenario_ranges)[:index]):
             raise ApcError(Diagnostic("E831", LOCATION, f"{gain.free.label} has two ranges"))
-    delays = [interval for interval in scenario_ranges if is_delay(system, interval.free)]
+    delays = [interval for interval in scenario_ranges if is_delay(model, interval.free)]
     if len(delays) > 1:
         names = " and ".join(delay.free.label for delay in delays)
         raise ApcError(Diagnostic("E831", OVER, f"only one delay can have a range, got {names}"))
-    counts = tuple(interval for interval in scenario_ranges if reaches_count(system, interval.free))
+    counts = tuple(interval for interval in scenario_ranges if reaches_count(model, interval.free))
     box = tuple(interval for interval in scenario_ranges if interval not in counts and interval not in delays)
     chosen_criterion = criterion_of(
-        system, criterion, LOCATION, [interval.free for interval in (*gains, *box)]
+        model, criterion, LOCATION, [interval.free for interval in (*gains, *box)]
     )
-    if chosen_criterion == NOMINAL and unreliable(system):
+    if chosen_criterion == NOMINAL and unreliable(model):
         message = "the criterion of this topology is mean-square, as its network loses or delays packets"
         raise ApcError(Diagnostic("E996", LOCATION, message, fix=f"--criterion {MEAN_SQUARE}"))
     if chosen_criterion == PASSIVE:
         for gain in (*gains, *box):
-            refuse_timing_parameter(system, gain.free, LOCATION, chosen_criterion)
+            refuse_timing_parameter(model, gain.free, LOCATION, chosen_criterion)
     for text in constraint:
         _refuse_former(text, CONSTRAINT)
     metrics = tuple(_parse_limit(text) for text in constraint if _names_metric(text))
@@ -282,20 +282,20 @@ def read_tuning_spec(
         require_extension("loss_models")
     if changing and (delay is None or chosen_criterion != NOMINAL):
         message = f"{CHANGING} needs a link delay with a range and the criterion {NOMINAL}"
-        fix = next((f'--over "{link.delay}=8 ms:20 ms"' for link in system.links), "")
+        fix = next((f'--over "{link.delay}=8 ms:20 ms"' for link in model.links), "")
         raise ApcError(Diagnostic("E996", CONSTRAINT, message, fix=fix if delay is None else ""))
     return TuningSpec(
         tuple(gains), best, counts, delay, box, decay, metrics, chosen_criterion, bool(changing)
     )
 
 
-def gripped_as_studied(system: Model) -> tuple[Model, str | None]:
+def gripped_as_studied(model: Model) -> tuple[Model, str | None]:
     """Return the model with the hands of `studies: tune:`, and the criterion.
 
     A criterion of None is the default criterion.
     """
-    hands = dict(system.tune).get("hands", FREE_HANDS)
-    return (system, PASSIVE) if hands == PASSIVE else (with_hands(system, hands), None)
+    hands = dict(model.tune).get("hands", FREE_HANDS)
+    return (model, PASSIVE) if hands == PASSIVE else (with_hands(model, hands), None)
 
 
 def read_seconds(text: str) -> float:
@@ -308,30 +308,30 @@ def read_seconds(text: str) -> float:
     return float(number)
 
 
-def _parse_gain(system: Model, given: str | NamedValues) -> Range:
+def _parse_gain(model: Model, given: str | NamedValues) -> Range:
     """Return the range of a gain; an error E995 for a delay or a number of peers."""
     name = named_values(given)[0]
     if name:
-        parameter_ref = find(system, name, FREE, counts=True)
-        is_count = reaches_count(system, parameter_ref)
-        if is_count or is_delay(system, parameter_ref):
+        parameter_ref = find(model, name, FREE, counts=True)
+        is_count = reaches_count(model, parameter_ref)
+        if is_count or is_delay(model, parameter_ref):
             message = f"{parameter_ref.label} can't be tuned continuously"
-            proposed = f"{parameter_ref.label}=2:10" if is_count else proposed_range_of(system, parameter_ref)
+            proposed = f"{parameter_ref.label}=2:10" if is_count else proposed_range_of(model, parameter_ref)
             raise ApcError(Diagnostic("E995", FREE, message, fix=pasted(OVER, proposed)))
-    return _parse_range(system, given, FREE)
+    return _parse_range(model, given, FREE)
 
 
-def _parse_range(system: Model, given: str | NamedValues, location: SourceLocation) -> Range:
+def _parse_range(model: Model, given: str | NamedValues, location: SourceLocation) -> Range:
     """Return a range of a parameter or of a number of peers; errors are located at the option."""
     name, values = named_values(given)
-    parameter_ref = find(system, name, location, counts=True) if name else None
-    if parameter_ref is not None and reaches_count(system, parameter_ref):
-        return _count_range(system, parameter_ref, values, location)
-    return parse_range(system, given, location)
+    parameter_ref = find(model, name, location, counts=True) if name else None
+    if parameter_ref is not None and reaches_count(model, parameter_ref):
+        return _count_range(model, parameter_ref, values, location)
+    return parse_range(model, given, location)
 
 
 def _count_range(
-    system: Model, parameter_ref: ParameterRef, values: Values, location: SourceLocation
+    model: Model, parameter_ref: ParameterRef, values: Values, location: SourceLocation
 ) -> Range:
     """Return a range of numbers of peers from its values; an error E830 or E842 for an invalid range."""
     ends = [part.strip() for part in values.split(":")] if isinstance(values, str) else list(values)
@@ -341,7 +341,7 @@ def _count_range(
         fix = pasted(location, f"{parameter_ref.label}=2:10")
         raise ApcError(Diagnostic("E830", location, subject, "LOW:HIGH", got, fix))
     end_values = [option_value(location.file, end, subject=parameter_ref.label, unit="1") for end in ends]
-    low, high = count_range(system, parameter_ref, end_values, float(end_values[0]), location)
+    low, high = count_range(model, parameter_ref, end_values, float(end_values[0]), location)
     if low < 1:
         message, fix = f"range of {parameter_ref.label}", f"{parameter_ref.label}=2:{max(high, 2)}"
         raise ApcError(Diagnostic("E842", location, message, "1 peer or more", f"{low}", fix))
@@ -353,7 +353,7 @@ def _count_range(
             )
         )
     try:
-        apply(system, [Override(parameter_ref, Fraction(low))])
+        apply(model, [Override(parameter_ref, Fraction(low))])
     except ApcError as error:  # too few for the dependent parameters
         raise ApcError(replace(mistake, location=location) for mistake in error.mistakes) from None
     return Range(parameter_ref, "1", Fraction(low), Fraction(high))

@@ -194,7 +194,7 @@ class Tuning(Result):
 
 @part("tune")
 def tune(
-    system: Model,
+    model: Model,
     spec: TuningSpec,
     *,
     seconds: float = math.inf,
@@ -204,7 +204,7 @@ def tune(
 
     Parameters
     ----------
-    system, spec
+    model, spec
         The model, and its specification from `read_tuning_spec`.
     seconds
         The time limit; the best result until then is returned, with its unproved demands.
@@ -217,15 +217,15 @@ def tune(
         The errors of the analyses, such as E898 an unsupported network, and of `transparency`; E996 a
         transparency metric that is undefined everywhere.
     """
-    with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
-        return _Tuner(system, spec, time.monotonic() + seconds, progress or (lambda _: None)).tuned()
+    with single_threaded(), finite_equations(model.origin.topology), np.errstate(all="ignore"):
+        return _Tuner(model, spec, time.monotonic() + seconds, progress or (lambda _: None)).tuned()
 
 
 @dataclass(eq=False)
 class _Tuner:
     """The optimization of the gains of a specification: scenarios are added until the proof succeeds."""
 
-    system: Model
+    model: Model
     spec: TuningSpec
     until: float
     progress: Progress
@@ -234,14 +234,14 @@ class _Tuner:
     evaluated: dict[bytes, Floats] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        self.constraints = ConstraintSet(numeric_model(self.system), self.spec, self.until)
+        self.constraints = ConstraintSet(numeric_model(self.model), self.spec, self.until)
         # A metric that is undefined everywhere is refused before the search.
         metrics = [metric for metric in self.spec.transparency_metrics if metric.name in RESPONSES]
         metrics += [metric for metric in self.spec.measured if metric.name == HINF]
         if metrics:
             transparency_in(self.constraints.numeric, metrics)
         self.every = self.constraints.every()
-        self.present = np.array([float(value_now(self.system, interval.free)) for interval in self.spec.free])
+        self.present = np.array([float(value_now(self.model, interval.free)) for interval in self.spec.free])
         scenarios_per_setting = len(self.every) // len(self.constraints.settings)
         self.scenarios = list(dict.fromkeys((self.every[0], self.every[-scenarios_per_setting])))
         if self.spec.changing:
@@ -491,16 +491,16 @@ class _Tuner:
         for numbers in order:
             labelled_counts = tuple((number.free.label, int(number.value)) for number in numbers)
             if self.timed_out:
-                proveds.append(Proved(labelled_counts, _timed_out_proof(self.system.name, ranges)))
+                proveds.append(Proved(labelled_counts, _timed_out_proof(self.model.name, ranges)))
                 continue
             self.progress(f"proving scenario {len(proveds) + 1} of {len(order)}")
-            topology = apply(self.system, [*gain_overrides, *numbers])
+            topology = apply(self.model, [*gain_overrides, *numbers])
             passive = self.spec.criterion == PASSIVE
             if passive and self.spec.box:
                 proveds.append(
                     Proved(
                         labelled_counts,
-                        replace(_timed_out_proof(self.system.name, ranges), notes=(POINTWISE,)),
+                        replace(_timed_out_proof(self.model.name, ranges), notes=(POINTWISE,)),
                     )
                 )
                 continue
@@ -511,9 +511,7 @@ class _Tuner:
                 if not ranges:
                     raise
                 # For example of nonlinear models, boxes cannot be proved.
-                proof = replace(
-                    _timed_out_proof(self.system.name, ranges), notes=(error.mistakes[0].message,)
-                )
+                proof = replace(_timed_out_proof(self.model.name, ranges), notes=(error.mistakes[0].message,))
             if proof.stable and (self._unproved or not self._transparency_is_proved(numbers, point)):
                 proof = replace(proof, verdict=UNDECIDED, stable=None, notes=(*proof.notes, SLOWER))
             if proof.stable and self.spec.changing and not self._stable_if_changing(topology):
@@ -556,7 +554,7 @@ class _Tuner:
             if result is None and proved.proof.stable is not False and not self.timed_out:
                 values = zip(spec.counts, proved.counts, strict=True)
                 counts = [Override(count.free, Fraction(number)) for count, (_, number) in values]
-                changed = apply(self.system, [*gain_overrides, *counts])
+                changed = apply(self.model, [*gain_overrides, *counts])
                 result = extension.varying_delay_result(changed, spec.delay)
             if result is not None:
                 yield proved.counts, result
@@ -621,7 +619,7 @@ class _Tuner:
         if column is not None and not feasible:
             best = value if spec.objective.level else float(optimum.gains[column])
         return Tuning(
-            topology=self.system.name,
+            topology=self.model.name,
             objective=spec.objective.label,
             unit=spec.objective.unit,
             maximize=spec.objective.maximize,
@@ -667,7 +665,7 @@ class _Tuner:
             limitations=(
                 *near_start(self.constraints.numeric),
                 *limitations(
-                    self.system,
+                    self.model,
                     network=spec.criterion != MEAN_SQUARE,
                     varied=[interval.free for interval in spec.over],
                 ),
@@ -680,7 +678,7 @@ class _Tuner:
         """Return the reason why no gains are stable with passive hands, "" if the equations do not
         imply it.
         """
-        return absolute_stability(numeric_model(self.system)).why if self.spec.criterion == PASSIVE else ""
+        return absolute_stability(numeric_model(self.model)).why if self.spec.criterion == PASSIVE else ""
 
     def _optimality_bound(self, optimum: Optimum, gains: Sequence[Fraction]) -> int | None:
         """Return the number of cells in the proof that no gains are better; None without a proof."""

@@ -61,12 +61,12 @@ MOVED = replaced(AVERAGE, ("{count: 3}", f"{{count: 3, set: {{device.x: [{START}
 def radii(judge: Judge, damping: float, rounds: int) -> None:
     """Compare the spectral radius of one topology."""
     value = f"{damping!r} N*s/m"
-    system = apc.set_parameters(compiled(AVERAGE), {"device.damping": value, "cube.damping": value})
-    exact = spectral_truth(system)
+    model = apc.set_parameters(compiled(AVERAGE), {"device.damping": value, "cube.damping": value})
+    exact = spectral_truth(model)
     assert isinstance(exact, Truth)
     stiffnesses = (f"{K_T * (1 + 1e-6 * number)!r} N/m" for number in range(1, 3 * rounds))
-    others = (apc.set_parameters(system, {"coordination.stiffness": one}) for one in stiffnesses)
-    first = apc.analyze(system)
+    others = (apc.set_parameters(model, {"coordination.stiffness": one}) for one in stiffnesses)
+    first = apc.analyze(model)
     calls: dict[str, Callable[[], float]] = {
         "apc": lambda: apc.analyze(next(others)).spectral_radius,
         "NumPy by hand": lambda: radius(damping),
@@ -83,10 +83,10 @@ def radii(judge: Judge, damping: float, rounds: int) -> None:
 
 def play(judge: Judge, rounds: int) -> None:
     """Compare the states at every tick."""
-    system = compiled(MOVED)
-    exact = exact_course(system, Fraction(SECONDS))
+    model = compiled(MOVED)
+    exact = exact_course(model, Fraction(SECONDS))
     assert not isinstance(exact, str), exact
-    ready = prepare(system, Settings(Fraction(SECONDS)), signals=["*.x", "*.v"])
+    ready = prepare(model, Settings(Fraction(SECONDS)), signals=["*.x", "*.v"])
     ticks = round(SECONDS / TICK) + 1
     runs = {
         "apc": median_time(partial(rows_of, ready), rounds),
@@ -113,9 +113,9 @@ def many(judge: Judge, rounds: int) -> None:
     """Compare 10,000 points at once with the batched program of two modes."""
     k_c, k_t = (one.ravel() for one in np.meshgrid(*[np.linspace(10.0, 3000.0, SIDE)] * 2))
     given = {"contact.stiffness": k_c, "coordination.stiffness": k_t}
-    system = compiled(AVERAGE)
-    calls = {"ours": lambda: apc.analyze_many(system, given), "theirs": lambda: modal_radii(k_c, k_t)}
-    results = apc.analyze_many(system, given)
+    model = compiled(AVERAGE)
+    calls = {"ours": lambda: apc.analyze_many(model, given), "theirs": lambda: modal_radii(k_c, k_t)}
+    results = apc.analyze_many(model, given)
     naive = modal_radii(k_c, k_t)
     times = alternate(calls, rounds)
     some = np.random.default_rng(1).choice(len(k_c), KNOWN, replace=False)

@@ -45,9 +45,9 @@ def required(judge: Judge, name: str, hands: str) -> list[float]:
     """Return the largest stable stiffness with such hands, by users, and judge it."""
     values = []
     for peers in PEERS:
-        system = topology(TOPOLOGIES[name], peers, STIFFNESS)
+        model = topology(TOPOLOGIES[name], peers, STIFFNESS)
         passive = hands == "passive"
-        held = system if passive else apc.with_hands(system, hands)
+        held = model if passive else apc.with_hands(model, hands)
         found = apc.critical(held, "coordination.stiffness", criterion="passive" if passive else None)
         assert found.value is not None
         values.append(found.value)

@@ -35,13 +35,13 @@ MOST_APART = 1e-9  # of forces in N, and of the rest in its own unit
 TICK = 1e-3  # seconds of a haptic loop's period
 
 
-def work_of_a_tick(system: Model) -> tuple[float, int]:
+def work_of_a_tick(model: Model) -> tuple[float, int]:
     """Return the processor time of one instant of the first peer, in s, and how many states it has."""
-    exchange = build_exchange(system, resolve(system).timings)
+    exchange = build_exchange(model, resolve(model).timings)
     names = [exchange.peer_name(one) for one in range(exchange.peers)]
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listening:
         addresses = {name: ("127.0.0.1", at + 1) for at, name in enumerate(names[1:])}
-        loop = PeerLoop(system, names[0], listening, addresses, digest=bytes(8), duration=Fraction(1))
+        loop = PeerLoop(model, names[0], listening, addresses, digest=bytes(8), duration=Fraction(1))
         given = forces_in_time(loop.simulation, 0)
         loop.player.warm_up()
         used = []
@@ -50,7 +50,7 @@ def work_of_a_tick(system: Model) -> tuple[float, int]:
             before, begin = len(loop.player.log), process_time()
             loop.player.advance(first, count, given)
             used.append((process_time() - begin) / (len(loop.player.log) - before))
-    return min(used), len(system.peer_types[system.groups[0].peer_type].states)
+    return min(used), len(model.peer_types[model.groups[0].peer_type].states)
 
 
 def main() -> None:
@@ -58,10 +58,10 @@ def main() -> None:
     parser = parser_of("play", __doc__)
     parser.add_argument("--seconds", type=int, default=60)
     with decided(parser) as (judge, given):
-        seconds, system = 3 if given.quick else given.seconds, compiled(MOVED)
+        seconds, model = 3 if given.quick else given.seconds, compiled(MOVED)
         how = LocalRun(duration=Fraction(seconds), secret=bytes(16), emulate=True, seed=None, patience=60.0)
-        peers = [part.run for part in run_all(system, how) if part.run is not None]
-        run = RealtimeRun("", system, tuple(sorted(peers, key=lambda one: one.number)))
+        peers = [part.run for part in run_all(model, how) if part.run is not None]
+        run = RealtimeRun("", model, tuple(sorted(peers, key=lambda one: one.number)))
         alongside = compare_run(run)
         print(f"three peers, {seconds} s, lan: 8 ms, jitter 4 ms, loss 5 %, in the sender; sealed packets")
         print("\n".join(ticks_text(alongside.ticks)))

@@ -75,13 +75,13 @@ class Tally:
     wrong: list[str] = field(default_factory=list)
 
 
-def truth(system: Model) -> tuple[flint.arb, int]:
+def truth(model: Model) -> tuple[flint.arb, int]:
     """Return the radius without eigenvalues that are 1, and how many these are (a drift counts twice)."""
-    classes = classes_of(system)
-    found = truth_of([(count, eigenvalues(one)) for _, count, one in frame_matrices(system, classes)])
+    classes = classes_of(model)
+    found = truth_of([(count, eigenvalues(one)) for _, count, one in frame_matrices(model, classes)])
     radius, rigid = found.radius, found.rigid
     # Without clocks any frame will do: the analysis takes a second, the reference a row of a simulation.
-    return radius if system.clocks else radius ** int(1 / ROW), rigid
+    return radius if model.clocks else radius ** int(1 / ROW), rigid
 
 
 def check(found: Analysis, radius: flint.arb, rigid: int) -> str:
@@ -106,13 +106,13 @@ def check(found: Analysis, radius: flint.arb, rigid: int) -> str:
     return "" if as_many or not found.stable else f"{found.rigid_modes} rigid, truth {rigid}"
 
 
-def _looked_into(system: Model, found: Analysis) -> list[str]:
+def _looked_into(model: Model, found: Analysis) -> list[str]:
     """Return what is wrong with what an analysis tells beside its verdict."""
     if found.stable is None and found.spectral_radius == 1:
         return []  # a motion that grows with t² leaves an eigenvalue 1, which the reference takes for a translation
     try:
-        reported = sensitivities_of(numeric_model(system), found)
-        return [check_sensitivities(system, reported), check_frequencies(found)]
+        reported = sensitivities_of(numeric_model(model), found)
+        return [check_sensitivities(model, reported), check_frequencies(found)]
     except Exception as error:  # whatever it is, it is a bug
         return [repr(error)]
 
@@ -128,7 +128,7 @@ def run(points: int, *, seed: int = 0, methods: Sequence[str] = ("auto",), draws
             try:
                 plain = compiled(text, library)
                 drawn = numbers(generator, shape, plain)
-                system = apply(plain, drawn)
+                model = apply(plain, drawn)
                 text += ", ".join(f"{one.free.label}={float(one.value)!r}" for one in drawn)
             except Exception as error:  # whatever it is, it is a bug
                 tally.wrong.append(f"not compiled: {error!r}\n{text}")
@@ -136,16 +136,15 @@ def run(points: int, *, seed: int = 0, methods: Sequence[str] = ("auto",), draws
             for method in methods:
                 look = method == "auto" and number % draws == 0
                 tally.wrong += [
-                    f"{method}: {one}\n{text}"
-                    for one in _analysed(system, method, shape.refused, look, tally)
+                    f"{method}: {one}\n{text}" for one in _analysed(model, method, shape.refused, look, tally)
                 ]
     return tally
 
 
-def _analysed(system: Model, method: str, due: str, look: bool, tally: Tally) -> list[str]:
+def _analysed(model: Model, method: str, due: str, look: bool, tally: Tally) -> list[str]:
     """Analyse a topology, take it down in the tally, and return what is wrong; `due` is the error it must give."""
     try:
-        used, found = timed(partial(analyze, numeric_model(system), method=method))
+        used, found = timed(partial(analyze, numeric_model(model), method=method))
     except ApcError as error:
         code = error.mistakes[0].code
         tally.as_they_must += code == due
@@ -153,7 +152,7 @@ def _analysed(system: Model, method: str, due: str, look: bool, tally: Tally) ->
         return [] if code in (*BEYOND, due) else [str(error)]
     except Exception as error:  # whatever it is, it is a bug
         return [repr(error)]
-    radius, rigid = truth(system)
+    radius, rigid = truth(model)
     tally.seconds += used
     tally.topologies += 1
     tally.undecided += found.stable is None
@@ -165,7 +164,7 @@ def _analysed(system: Model, method: str, due: str, look: bool, tally: Tally) ->
     faults = [check(found, radius, rigid), f"{due} was due" if due else ""]
     if look:
         tally.looked_into += 1
-        faults += _looked_into(system, found)
+        faults += _looked_into(model, found)
     return [one for one in faults if one]
 
 

@@ -57,20 +57,20 @@ def topology(generator: random.Random) -> str:
     return next(text for text in texts if not any(name in text for name in own))
 
 
-def check_sensitivities(system: Model, found: Analysis | Sensitivities) -> str:
+def check_sensitivities(model: Model, found: Analysis | Sensitivities) -> str:
     """Return what is wrong with the derivatives of a topology's spectral radius, "" if nothing is.
 
     Of an analysis the radius is compared with theirs.
     """
-    printed = found if isinstance(found, Sensitivities) else sensitivities(numeric_model(system))
+    printed = found if isinstance(found, Sensitivities) else sensitivities(numeric_model(model))
     if isinstance(found, Analysis) and printed.active:
         apart = abs(printed.radius - found.spectral_radius)
         if not apart <= 1e-9 + found.spectral_radius_error:
             return f"the radius is {found.spectral_radius}, that of the derivatives {printed.radius}"
-    if refusal(system, in_time=False) or not printed.active:
+    if refusal(model, in_time=False) or not printed.active:
         return ""
     with precision(BITS):
-        here = _matrices(system)
+        here = _matrices(model)
         radius = max((float(abs(v)) for m in here for v in _values(m) if not _is_rigid(v)), default=0.0)
         if abs(radius - printed.radius) > SAME * max(1.0, radius):
             return f"the radius of the derivatives is {printed.radius}, truth {radius}"
@@ -80,7 +80,7 @@ def check_sensitivities(system: Model, found: Analysis | Sensitivities) -> str:
         moved: dict[str, list[Any]] = {}
         for row in printed.rows:
             if row.parameter not in moved:
-                moved[row.parameter] = _slopes(system, here, row.parameter)
+                moved[row.parameter] = _slopes(model, here, row.parameter)
             truths = [rate for top in tops[row.mode] for rate in _rates(top, moved[row.parameter])]
             nearest, most = min(truths, key=lambda rate: abs(row.derivative - rate)), max(map(abs, truths))
             allowed = ROUNDED * (most + max(radius, LEAST) / abs(row.value or 1.0))
@@ -89,10 +89,10 @@ def check_sensitivities(system: Model, found: Analysis | Sensitivities) -> str:
     return ""
 
 
-def _matrices(system: Model) -> list[Any]:
+def _matrices(model: Model) -> list[Any]:
     """Return the frame matrices of all closed systems."""
-    frame = numeric_model(system).schedules[0].frame_s
-    return [_whole_map(one, frame) for one in _happenings(system)]
+    frame = numeric_model(model).schedules[0].frame_s
+    return [_whole_map(one, frame) for one in _happenings(model)]
 
 
 def _values(matrix: Any) -> list[Any]:
@@ -150,13 +150,13 @@ def _scaled(matrix: Any) -> Any:
     return matrix * (flint.acb(1) / flint.acb(size))
 
 
-def _slopes(system: Model, here: Sequence[Any], name: str) -> list[Any]:
+def _slopes(model: Model, here: Sequence[Any], name: str) -> list[Any]:
     """Return the derivatives of all frame matrices by a parameter, set as `--set` does."""
-    free = find(system, name)
-    value = parameter_of(system, free).value
+    free = find(model, name)
+    value = parameter_of(model, free).value
 
     def at(number: float) -> list[Any]:
-        moved = _matrices(apply(system, [Override(free, Fraction(number))]))
+        moved = _matrices(apply(model, [Override(free, Fraction(number))]))
         return [flint.acb_mat(matrix.mid()) for matrix in moved]
 
     if value:
@@ -199,14 +199,14 @@ def check_frequencies(found: Analysis) -> str:
     return ""
 
 
-def _happenings(system: Model) -> Iterator[Happening]:
+def _happenings(model: Model) -> Iterator[Happening]:
     """Yield the common motion, and each class's differences, as peers to follow."""
-    classes = classes_of(system)
-    subsystems = build_peers(system, classes.peers, classes.groups, linear=True)
-    yield Happening(system, subsystems, _common_whom(subsystems, classes))
+    classes = classes_of(model)
+    subsystems = build_peers(model, classes.peers, classes.groups, linear=True)
+    yield Happening(model, subsystems, _common_whom(subsystems, classes))
     for place, count in enumerate(classes.counts):
         if count > 1:
-            yield Happening(system, [subsystems[place]], _difference_whom(subsystems, classes, place))
+            yield Happening(model, [subsystems[place]], _difference_whom(subsystems, classes, place))
 
 
 def _whole_map(topology: Happening, frame: Fraction) -> Any:
@@ -223,9 +223,9 @@ def run(points: int, *, seed: int = 0) -> list[str]:
     generator, wrong = random.Random(seed), []
     for _ in range(points):
         text = topology(generator)
-        system = compiled(text)
-        found = analyze(numeric_model(system))
+        model = compiled(text)
+        found = analyze(numeric_model(model))
         wrong += [
-            f"{one}\n{text}" for one in (check_sensitivities(system, found), check_frequencies(found)) if one
+            f"{one}\n{text}" for one in (check_sensitivities(model, found), check_frequencies(found)) if one
         ]
     return wrong

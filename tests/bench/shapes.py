@@ -300,9 +300,9 @@ def _rows(generator: random.Random) -> str:
     return f"arcs: [{', '.join(arcs)}]"
 
 
-def numbers(generator: random.Random, shape: Shape, system: Model) -> list[Override]:
+def numbers(generator: random.Random, shape: Shape, model: Model) -> list[Override]:
     """Return numbers at random: a decade is as likely as the next."""
-    known = {parameter.name for parameter in system.parameters}
+    known = {parameter.name for parameter in model.parameters}
     values = []
     for name, (low, high, zero) in shape.ranges.items():
         value = 0.0 if generator.random() < zero else 10 ** generator.uniform(low, high)

@@ -29,9 +29,9 @@ STATES = ("device.x", "device.v", "cube.x", "cube.v")
 
 def speed(judge: Judge) -> None:
     """10 s of the three-user topology, every signal recorded, beside the loops in NumPy and in C."""
-    system = compiled(MOVED)
+    model = compiled(MOVED)
     began = time.perf_counter()  # the C compiler's time included
-    run = simulate(system, duration=Fraction(10))
+    run = simulate(model, duration=Fraction(10))
     first = time.perf_counter() - began
     loop, by_hand = median_time(partial(numpy_loop, 10_001), 3)
     in_c, end = median_time(partial(c_loop, USERS, 1250, 1), REPEATS)
@@ -53,7 +53,7 @@ def speed(judge: Judge) -> None:
         ),
     ]
     for name, jit, part, most_s in (("virtual machine", False, 0.8, None), ("machine code", True, 0.2, 0.01)):
-        used, rows = median_time(partial(rows_of, prepare(system, Settings(Fraction(10), jit=jit))), REPEATS)
+        used, rows = median_time(partial(rows_of, prepare(model, Settings(Fraction(10), jit=jit))), REPEATS)
         ours = Timed("apc", used, off(rows), LINEAR)
         most = {others[0].program: part}
         judge.table(f"10 s of three users, {name}", [ours, *others], most_s=most_s, most=most)

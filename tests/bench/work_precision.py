@@ -152,11 +152,11 @@ def truth_of(topology: str) -> tuple[str, tuple[str, ...], Floats, float]:
 def compared(judge: Judge, topology: str, methods: Sequence[Method]) -> None:
     """Print and judge what each method takes and is off by on a topology."""
     text, names, exact, uncertainty = truth_of(topology)
-    system = compiled(text)
+    model = compiled(text)
     print(f"\n{topology}, {float(DURATION):g} s, the truth certain to {uncertainty:.0e}")
     print(f"  {'method':<24}{'error / range':>14}{'of real time':>14}")
     for method in methods:
-        ready = prepare(system, Settings(DURATION, method), signals=["*.x"])
+        ready = prepare(model, Settings(DURATION, method), signals=["*.x"])
         seconds, rows = median_time(partial(rows_of, ready), REPEATS)
         places = [[signal.name for signal in ready.signals].index(name) for name in names]
         error = float((np.abs(rows[:, places] - exact) / np.ptp(exact, axis=0)).max())

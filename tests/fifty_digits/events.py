@@ -82,17 +82,17 @@ class Play:
     packets: list[list[list[tuple[Fraction, list[Number]]]]]
 
 
-def refusal(system: Model, *, in_time: bool) -> str:
+def refusal(model: Model, *, in_time: bool) -> str:
     """Say why there is no reference, "" if there is one.
 
     Parameters
     ----------
-    system
+    model
         The compiled topology.
     in_time
         For a run in time; else for the eigenvalues of a frame.
     """
-    for peer_type in (peer_type.linear or peer_type for peer_type in system.peer_types):
+    for peer_type in (peer_type.linear or peer_type for peer_type in model.peer_types):
         functions = [*(c.tick for c in peer_type.clocks), *(s.send for s in peer_type.sends)]
         if not all(map(is_rational, functions)) or not _has_exact_slopes(peer_type.derivative):
             return f"the equations of {peer_type.name} contain functions whose values are rounded"
@@ -111,7 +111,7 @@ def refusal(system: Model, *, in_time: bool) -> str:
         # What is heard at the start is not looked up: slopes must not depend on it.
         if not in_time and not all(_is_affine(one.tick, slice(3, 4)) for one in peer_type.clocks):
             return f"{peer_type.name} is not linear in what it hears"
-    if in_time and any(link.channel is not None for link in system.links):
+    if in_time and any(link.channel is not None for link in model.links):
         return "packets get lost or come late by chance"
     return ""
 
@@ -225,7 +225,7 @@ def _rationals(rows: Sequence[Sequence[Fraction]]) -> Any:
     return flint.fmpq_mat(len(rows), len(rows), entries)
 
 
-def received_weights(system: Model, peer: int) -> dict[str, Fraction]:
+def received_weights(model: Model, peer: int) -> dict[str, Fraction]:
     """Return the exact sum of the weights that a peer receives over each link with arcs, by its parameter."""
     return {
         count_of(link.name): sum(
@@ -238,35 +238,35 @@ def received_weights(system: Model, peer: int) -> dict[str, Fraction]:
             ),
             Fraction(0),
         )
-        for link in system.links
+        for link in model.links
         if link.graph.shape == "arcs"
     }
 
 
-def build_peers(system: Model, peers: Sequence[int], groups: Sequence[int], *, linear: bool) -> list[Peer]:
+def build_peers(model: Model, peers: Sequence[int], groups: Sequence[int], *, linear: bool) -> list[Peer]:
     """Build some peers, at the present precision.
 
     Parameters
     ----------
-    system
+    model
         The compiled topology.
     peers, groups
         Their numbers in the topology, and their groups'.
     linear
         Leave constant forces out, and take the slopes at the start where something is not linear.
     """
-    numbers = resolve(system)
+    numbers = resolve(model)
     seconds = numbers.timings
-    starts = np.cumsum([0] + [group.count for group in system.groups])
-    period = {clock.name: seconds[clock.period] for clock in system.clocks}
-    link_of = {link.name: link for link in system.links}
+    starts = np.cumsum([0] + [group.count for group in model.groups])
+    period = {clock.name: seconds[clock.period] for clock in model.clocks}
+    link_of = {link.name: link for link in model.links}
     found = []
     for peer, group in zip(peers, groups, strict=True):
-        nonlinear = system.peer_types[system.groups[group].peer_type]
+        nonlinear = model.peer_types[model.groups[group].peer_type]
         peer_type = nonlinear.linear or nonlinear
         row = numbers.rows[group][peer - int(starts[group])]
         parameters = list(map(Fraction, numbers.parameters[group][row].tolist()))
-        value = dict(zip(peer_type.parameters, parameters, strict=True)) | received_weights(system, peer)
+        value = dict(zip(peer_type.parameters, parameters, strict=True)) | received_weights(model, peer)
         parameters = [value[name] for name in peer_type.parameters]
         delays = tuple(seconds[hold.delay] for hold in peer_type.holds)
         start_x = tuple(value[state.start] for state in peer_type.states)
@@ -302,7 +302,7 @@ def build_peers(system: Model, peers: Sequence[int], groups: Sequence[int], *, l
                 ),
                 sent_back=tuple(
                     math.ceil(
-                        max(seconds[name] for name in _delays(system, send.link))
+                        max(seconds[name] for name in _delays(model, send.link))
                         / period[link_of[send.link].clock]
                     )
                     + 1
@@ -315,29 +315,29 @@ def build_peers(system: Model, peers: Sequence[int], groups: Sequence[int], *, l
     return found
 
 
-def _delays(system: Model, name: str) -> list[str]:
+def _delays(model: Model, name: str) -> list[str]:
     """Return the timings of all delays of a link."""
-    link = next(one for one in system.links if one.name == name)
+    link = next(one for one in model.links if one.name == name)
     return [*link.delays]
 
 
 class Happening:
     """Some peers and who hears whom among them; what happens when."""
 
-    def __init__(self, system: Model, subsystems: Sequence[Peer], whom: Whom) -> None:
+    def __init__(self, model: Model, subsystems: Sequence[Peer], whom: Whom) -> None:
         self.subsystems, self.whom = subsystems, whom
-        self.seconds = resolve(system).timings
-        clocks = {clock.name: clock for clock in system.clocks}
+        self.seconds = resolve(model).timings
+        clocks = {clock.name: clock for clock in model.clocks}
         self.clocks = {
             name: (self.seconds[one.phase] % self.seconds[one.period], self.seconds[one.period])
             for name, one in clocks.items()
         }
-        self.clock_of = {link.name: link.clock for link in system.links}
+        self.clock_of = {link.name: link.clock for link in model.links}
         periods = [period for _, period in self.clocks.values()]
         self.frame = _common(periods) if periods else Fraction(1, 1000)
         self.delay: dict[tuple[str, int, int], Fraction] = {}
-        names = [group.name for group in system.groups]
-        for link in system.links:
+        names = [group.name for group in model.groups]
+        for link in model.links:
             late = {(names.index(p.sender), names.index(p.receiver)): p.delay for p in link.pairs}
             for h in range(len(names)):
                 for g in range(len(names)):

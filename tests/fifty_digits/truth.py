@@ -53,15 +53,15 @@ class Classes:
     weights: Mapping[str, tuple[tuple[Fraction, ...], ...]]
 
 
-def classes_of(system: Model) -> Classes:
+def classes_of(model: Model) -> Classes:
     """Find the peers that can change places: equal ones on complete graphs and stars, else none."""
-    rows = resolve(system).rows
-    shapes = {link.graph.shape for link in system.links}
+    rows = resolve(model).rows
+    shapes = {link.graph.shape for link in model.links}
     apart = not shapes <= {"complete", "star"}
     counts: dict[tuple[int, ...], int] = {}
     first: dict[tuple[int, ...], int] = {}
     number = 0
-    for place, group in enumerate(system.groups):
+    for place, group in enumerate(model.groups):
         own = rows[place]
         if not own.strides[0] and not apart and not (number == 0 and "star" in shapes):
             counts[place, 0, 0], first[place, 0, 0] = group.count, number
@@ -75,7 +75,7 @@ def classes_of(system: Model) -> Classes:
             number += 1
     keys = list(counts)
     weights = {}
-    for link in system.links:
+    for link in model.links:
         if link.graph.shape == "complete":
             table = [[Fraction(1)] * len(keys) for _ in keys]
         elif link.graph.shape == "star" and not apart:
@@ -90,7 +90,7 @@ def classes_of(system: Model) -> Classes:
     )
 
 
-def frame_matrices(system: Model, classes: Classes) -> list[tuple[str, int, Any]]:
+def frame_matrices(model: Model, classes: Classes) -> list[tuple[str, int, Any]]:
     """Return the one-frame maps of the common motion and of each class's differences.
 
     Each is (name, how often the whole holds it, `flint.arb_mat`), at the present precision. Where a class of
@@ -98,16 +98,16 @@ def frame_matrices(system: Model, classes: Classes) -> list[tuple[str, int, Any]
 
     Parameters
     ----------
-    system, classes
+    model, classes
         The compiled topology, for which `refusal` is "", and its `classes_of`.
     """
-    subsystems = build_peers(system, classes.peers, classes.groups, linear=True)
-    found = [("common", 1, _map(Happening(system, subsystems, _common_whom(subsystems, classes))))]
+    subsystems = build_peers(model, classes.peers, classes.groups, linear=True)
+    found = [("common", 1, _map(Happening(model, subsystems, _common_whom(subsystems, classes))))]
     for place, count in enumerate(classes.counts):
         if count > 1:
             whom = _difference_whom(subsystems, classes, place)
             found.append(
-                (f"difference {place}", count - 1, _map(Happening(system, [subsystems[place]], whom)))
+                (f"difference {place}", count - 1, _map(Happening(model, [subsystems[place]], whom)))
             )
     return found
 
@@ -229,22 +229,22 @@ class Truth:
             return str(self.radius.str(DIGITS, radius=False))
 
 
-def spectral_truth(system: Model) -> Truth | str:
+def spectral_truth(model: Model) -> Truth | str:
     """Return the truth about one frame of a topology, or why there is none.
 
     Two precisions have to agree on the digits.
     """
-    reason = refusal(system, in_time=False)
+    reason = refusal(model, in_time=False)
     if reason:
         return reason
-    classes = classes_of(system)
-    moving = sum(len(system.peer_types[system.groups[group].peer_type].states) for group in classes.groups)
+    classes = classes_of(model)
+    moving = sum(len(model.peer_types[model.groups[group].peer_type].states) for group in classes.groups)
     last: Truth | None = None
     for bits in PRECISIONS:
         with precision(bits):
             if moving > MOST_MOVING:
                 return f"{moving} states of motion take too long at {DIGITS} digits"
-            found = frame_matrices(system, classes)
+            found = frame_matrices(model, classes)
             most = max(matrix.nrows() for _, _, matrix in found)
             if most > MOST_STATES:
                 return f"the eigenvalues of {most} states take too long at {DIGITS} digits"
@@ -273,12 +273,12 @@ def _agree(one: Any, other: Any) -> bool:
     return bool(apart <= size * flint.arb(10) ** (-DIGITS)) or bool(size < flint.arb(10) ** (-DIGITS))
 
 
-def exact_course(system: Model, duration: Fraction) -> tuple[tuple[str, ...], Any] | str:
+def exact_course(model: Model, duration: Fraction) -> tuple[tuple[str, ...], Any] | str:
     """Return the continuous states of all peers at every tick of the fastest clock, or why they can't be had.
 
     Parameters
     ----------
-    system
+    model
         The compiled topology, each peer on its own.
     duration
         In seconds.
@@ -288,12 +288,12 @@ def exact_course(system: Model, duration: Fraction) -> tuple[tuple[str, ...], An
     The names (`user[1].cube.x`), and the values (rows, names) in SI, the nearest floats to the truth: its
     balls are smaller than `DIGITS` digits of the largest value.
     """
-    reason = refusal(system, in_time=True)
+    reason = refusal(model, in_time=True)
     if reason:
         return reason
     for bits in PRECISIONS:
         with precision(bits):
-            names, rows = _course(system, duration)
+            names, rows = _course(model, duration)
             largest = max((abs(float(one)) for row in rows for one in row), default=0.0)
             widest = max((float(one.rad()) for row in rows for one in row), default=0.0)
             if widest <= 10.0**-DIGITS * max(largest, 10.0**-DIGITS):
@@ -301,11 +301,11 @@ def exact_course(system: Model, duration: Fraction) -> tuple[tuple[str, ...], An
     return f"not certain to {DIGITS} digits at {PRECISIONS[-1]} bits"
 
 
-def _course(system: Model, duration: Fraction) -> tuple[tuple[str, ...], list[list[Any]]]:
+def _course(model: Model, duration: Fraction) -> tuple[tuple[str, ...], list[list[Any]]]:
     """Play a topology from time 0 and keep the states at the ticks."""
-    whole = _everybody(system)
-    subsystems = build_peers(system, whole.peers, whole.groups, linear=False)
-    topology = Happening(system, subsystems, _common_whom(subsystems, whole))
+    whole = _everybody(model)
+    subsystems = build_peers(model, whole.peers, whole.groups, linear=False)
+    topology = Happening(model, subsystems, _common_whom(subsystems, whole))
     long_ago = Fraction(-(10**9))
     play = Play([], [], [])
     for subsystem in subsystems:
@@ -329,9 +329,9 @@ def _course(system: Model, duration: Fraction) -> tuple[tuple[str, ...], list[li
             topology.play(play, now, instant)
             now = instant
         rows.append([flint.arb(value) for x in play.x for value in x])
-    starts = np.cumsum([0] + [group.count for group in system.groups])
+    starts = np.cumsum([0] + [group.count for group in model.groups])
     names = tuple(
-        f"{system.groups[subsystem.group].name}[{peer - int(starts[subsystem.group]) + 1}].{state.name}"
+        f"{model.groups[subsystem.group].name}[{peer - int(starts[subsystem.group]) + 1}].{state.name}"
         for peer, subsystem in zip(whole.peers, subsystems, strict=True)
         for state in subsystem.peer_type.states
     )
@@ -346,12 +346,12 @@ def _remembered(clock: Any, start: Sequence[Fraction]) -> list[Number]:
     return values
 
 
-def _everybody(system: Model) -> Classes:
+def _everybody(model: Model) -> Classes:
     """Return every peer as a class of its own."""
-    groups = tuple(place for place, group in enumerate(system.groups) for _ in range(group.count))
+    groups = tuple(place for place, group in enumerate(model.groups) for _ in range(group.count))
     n = len(groups)
     weights = {}
-    for link in system.links:
+    for link in model.links:
         table = [[Fraction(link.graph.shape == "complete")] * n for _ in groups]
         if link.graph.shape != "complete":
             for (sender, receiver), weight in zip(*arcs(link.graph, n), strict=True):

@@ -160,7 +160,7 @@ def _changed_array(rng: random.Random, content: bytes) -> bytes:
 def bases() -> tuple[tuple[Origin, bytes], ...]:
     """Return whole models to start from: what each was made from, and itself."""
     found = (compile_topology(MODELS / "topologies" / f"{topology}.yaml") for topology in _TOPOLOGIES)
-    return tuple((system.origin, model_of(system)) for system in found)
+    return tuple((model.origin, model_of(model)) for model in found)
 
 
 def unsealed(origin: bytes, model: bytes) -> bytes:
@@ -211,16 +211,16 @@ def ask(path: Path, *, everything: bool = False) -> str:
     would take many times as long, and `analyze` asks what it asks of the network.
     """
     try:
-        system = load_fresh(path)
+        model = load_fresh(path)
     except ApcError:
         return "refused"
-    first = system.parameters[0].name if system.parameters else "device.mass"
+    first = model.parameters[0].name if model.parameters else "device.mass"
     questions: list[Callable[[], object]] = [
-        lambda: analyze(system),
-        lambda: simulate(system, duration="20 ms", jit=False),
+        lambda: analyze(model),
+        lambda: simulate(model, duration="20 ms", jit=False),
     ]
     if everything or path.stat().st_size % 8 == 0:
-        questions.append(lambda: critical(system, first, criterion="nominal"))
+        questions.append(lambda: critical(model, first, criterion="nominal"))
     for question in questions:
         try:
             question()
@@ -239,13 +239,13 @@ def recorded() -> dict[str, bytes]:
         folder = Path(name)
         moving = replaced(AVERAGE, ("{count: 3}", "{count: 2, set: {device.x: 3 mm}}"))
         (folder / "topology.yaml").write_text(moving, encoding="utf-8")
-        system = compile_topology(folder / "topology.yaml")
+        model = compile_topology(folder / "topology.yaml")
         names = ("user[1]", "user[2]")
         sockets = {peer: socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for peer in names}
         for one in sockets.values():
             one.bind(("127.0.0.1", 0))
         loops = [
-            PeerLoop(system, peer, sockets[peer], others, digest=digest_of(system), duration=Fraction(1, 20))
+            PeerLoop(model, peer, sockets[peer], others, digest=digest_of(model), duration=Fraction(1, 20))
             for peer in names
             for others in [{one: to.getsockname() for one, to in sockets.items() if one != peer}]
         ]
@@ -254,7 +254,7 @@ def recorded() -> dict[str, bytes]:
             thread.start()
         for thread in threads:
             thread.join()
-        write_run(folder / RUN, system, [run_of(loop, digest_of(system), ()) for loop in loops])
+        write_run(folder / RUN, model, [run_of(loop, digest_of(model), ()) for loop in loops])
         return {path.name: path.read_bytes() for path in sorted((folder / RUN).iterdir())}
 
 

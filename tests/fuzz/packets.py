@@ -25,7 +25,7 @@ EXTREME = (0, 1, -1, 2**31, 2**61 - 1, 1 - 2**61, 2**63 - 1, -(2**63))
 Forgery = tuple[bytes, Address]
 
 
-def run_packets(system: Model, count: int, seed: int) -> tuple[list[str], Counter[str]]:
+def run_packets(model: Model, count: int, seed: int) -> tuple[list[str], Counter[str]]:
     """Give a peer so many forged datagrams, in meeting the others and in playing with them.
 
     Returns
@@ -38,10 +38,10 @@ def run_packets(system: Model, count: int, seed: int) -> tuple[list[str], Counte
     failures: list[str] = []
     outcomes: Counter[str] = Counter()
     with pytest.MonkeyPatch.context() as patch:
-        earlier = _met(patch, system)
+        earlier = _met(patch, model)
         _play(earlier)
         for given in (_meeting, _playing):
-            here = _met(patch, system)
+            here = _met(patch, model)
             _play(here)
             for index in range(given is _playing, count, 2):
                 noise = random.Random(f"{seed}/{index}")
@@ -74,9 +74,9 @@ class _Topology:
         )
 
 
-def _met(patch: pytest.MonkeyPatch, system: Model) -> _Topology:
+def _met(patch: pytest.MonkeyPatch, model: Model) -> _Topology:
     wire = Wire(patch)
-    loop = loop_at(wire, system, DIGEST, SECRET)
+    loop = loop_at(wire, model, DIGEST, SECRET)
     others = [Other(wire, number, DIGEST, SECRET) for number in (1, 2)]
     loop.meet(60)
     return _Topology(wire, loop, others)

@@ -150,9 +150,9 @@ def _warm_up() -> None:
     before = Path.cwd()
     os.chdir(MODELS / "topologies")
     for topology in ("three-users-average", "experiment-average", "finger", "users-table"):
-        system = apc.compile(f"{topology}.yaml")
-        apc.analyze(system)
-        apc.simulate(system, duration="20 ms", jit=False)
+        model = apc.compile(f"{topology}.yaml")
+        apc.analyze(model)
+        apc.simulate(model, duration="20 ms", jit=False)
     os.chdir(before)
     odd = MODELS.joinpath("topologies", "three-users-average.yaml").read_bytes()
     _decided(
@@ -232,9 +232,9 @@ def _decided(given: Input) -> tuple[str, str]:
             run_stages(Path(TOPOLOGY), until="compiled")
             _listening = False
             if given.sort == PLAYED:
-                system = apc.compile(TOPOLOGY)
-                apc.analyze(system)
-                apc.simulate(system, duration="20 ms", jit=False)
+                model = apc.compile(TOPOLOGY)
+                apc.analyze(model)
+                apc.simulate(model, duration="20 ms", jit=False)
         except ApcError as error:
             return _fault_of(error, dict(given.files)) or ("refused", "")
         return "compiled", ""

@@ -92,7 +92,7 @@ class Running:
 
 
 def differences(
-    system: apc.Model, folder: Path, *, duration: str, method: str = "", device: str | None = None
+    model: apc.Model, folder: Path, *, duration: str, method: str = "", device: str | None = None
 ) -> dict[str, tuple[float, float]]:
     """Play a topology, and its peers in C with the devices' motion and the packets' arrivals of that run.
 
@@ -100,8 +100,8 @@ def differences(
     has it. Returns by signal the largest difference and the largest value.
     """
     how = parse_method(method) if method else DEFAULT
-    plan = plan_of(system, how)
-    course = apc.simulate(system, duration=duration, method=method or None, jit=False)
+    plan = plan_of(model, how)
+    course = apc.simulate(model, duration=duration, method=method or None, jit=False)
     column = {one.name: course.values[:, place] for place, one in enumerate(course.signals)}
     quantum = plan.schedules[0].quantum
     marks = [round(float(Fraction(float(t)) / quantum)) for t in course.time]
@@ -141,20 +141,20 @@ class _Network:
         self.plan, self.sent = plan, dict[tuple[str, int, int], Mapping[str, float]]()
         self.quantum = plan.schedules[0].quantum
         timings = plan.numbers.timings
-        clocks = {one.name: one for one in plan.system.clocks}
+        clocks = {one.name: one for one in plan.model.clocks}
         self.grid = {
             link: (int(timings[own.period] / self.quantum), int(timings[own.phase] / self.quantum))
             for link, one in plan.exchange.links.items()
             for own in (clocks[one.clock],)
         }
         self.late: dict[tuple[str, int, int], list[float]] = {}
-        self.links = {one.name: one for one in plan.system.links}
+        self.links = {one.name: one for one in plan.model.links}
         for name, link in self.links.items():
             if link.channel is None:
                 continue
-            law = channel_law(plan.system, link, link.delay)
+            law = channel_law(plan.model, link, link.delay)
             for arc in itertools.permutations(range(plan.exchange.peers), 2):
-                used = PacketSource(law, name, [arc], seed=plan.system.experiment.seed).take(MOST_PACKETS)
+                used = PacketSource(law, name, [arc], seed=plan.model.experiment.seed).take(MOST_PACKETS)
                 self.late[(name, *arc)] = used[0].tolist()
 
     def send(self, peer: ExportedPeer, at: int, printed: Mapping[str, float]) -> None:

@@ -122,8 +122,8 @@ def test_links_of_any_name_compile_as_c_and_cpp(tmp_path: Path) -> None:
     compile_all(peer_of(plan_of(hostile(), DEFAULT), 0, DEFAULT, device=None), tmp_path)
 
 
-def compile_fmu(system: apc.Model, folder: Path, peer: str = "") -> None:
-    unit = topology_unit(system, peer=peer)
+def compile_fmu(model: apc.Model, folder: Path, peer: str = "") -> None:
+    unit = topology_unit(model, peer=peer)
     for file, text in unit.texts.items():
         (folder / file).write_text(text, encoding="ascii")
     listed = [file for file in unit.texts if file.endswith(".c")]
@@ -157,9 +157,9 @@ GROUPS = ["begin", "next", "a", "A", "a_1_link_b", "link_b_1", "newest_link_b", 
 @pytest.mark.whole
 def test_peers_of_any_name_are_distinct_in_an_fmu(tmp_path: Path) -> None:
     names = ["b_1", "b_1_newest", "b_1_way", "p", "p_sent"]
-    system = compiled(topology(names, GROUPS, ("while", "linux"), ("x", "quanta")))
-    compile_fmu(system, tmp_path)
-    codes = [peer_of(plan_of(system, DEFAULT), 2 * k, DEFAULT) for k in range(len(GROUPS))]
+    model = compiled(topology(names, GROUPS, ("while", "linux"), ("x", "quanta")))
+    compile_fmu(model, tmp_path)
+    codes = [peer_of(plan_of(model, DEFAULT), 2 * k, DEFAULT) for k in range(len(GROUPS))]
     assert len({code.identifier for code in codes}) == len(GROUPS)
     assert "M_SQRT1_2" not in {identifier("M_SQRT1[2]")}
 
@@ -185,8 +185,8 @@ def test_random_names_compile(tmp_path: Path) -> None:
     names = {
         chosen.choice("aZx") + "".join(chosen.choices("aA_09", k=chosen.randrange(6))) for _ in range(60)
     }
-    system = compiled(topology(sorted(names)[:40], ["peers_1"], ("h", "n"), ("d__", "d_")))
-    compile_all(peer_of(plan_of(system, DEFAULT), 0, DEFAULT, device=None), tmp_path)
+    model = compiled(topology(sorted(names)[:40], ["peers_1"], ("h", "n"), ("d__", "d_")))
+    compile_all(peer_of(plan_of(model, DEFAULT), 0, DEFAULT, device=None), tmp_path)
 
 
 def test_the_command_writes_such_names(tmp_path: Path) -> None:

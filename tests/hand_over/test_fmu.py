@@ -69,11 +69,11 @@ def written(text: str, folder: Path, *, peer: str = "", method: str = "") -> tup
     return path, unit
 
 
-def gap(system: apc.Model, path: Path, unit: FmuContent, method: str = "", seconds: float = 0.5) -> float:
+def gap(model: apc.Model, path: Path, unit: FmuContent, method: str = "", seconds: float = 0.5) -> float:
     """Return how far what FMPy plays is from what `simulate` plays, of the largest value."""
     import fmpy as player
 
-    course = apc.simulate(system, duration=f"{seconds} s", method=method or None, jit=False)
+    course = apc.simulate(model, duration=f"{seconds} s", method=method or None, jit=False)
     found = player.simulate_fmu(path, stop_time=seconds, output_interval=unit.step)
     rows = np.array([found[one.name] for one in course.signals]).T
     assert rows.shape == course.values.shape
@@ -94,9 +94,9 @@ def test_recorded_delays_are_played_one_after_another(fmpy: Any, tmp_path: Path)
     (tmp_path / "delays.csv").write_text("delay [ms]\n8\n9.5\n\n21\n7\n8\n30\n", encoding="utf-8")
     text = replaced(MOVED, ("delay: 8 ms}", "trace: delays.csv}"))
     (tmp_path / "topology.yaml").write_text(text, encoding="utf-8")
-    system = apc.compile(tmp_path / "topology.yaml")
-    write_fmu(path := tmp_path / "topology.fmu", unit := topology_unit(system))
-    assert gap(system, path, unit) < 1e-9
+    model = apc.compile(tmp_path / "topology.yaml")
+    write_fmu(path := tmp_path / "topology.fmu", unit := topology_unit(model))
+    assert gap(model, path, unit) < 1e-9
 
 
 @pytest.mark.whole
@@ -154,9 +154,9 @@ def test_peers_joined_by_a_network_of_ones_own_are_the_topology(
     text: str, late: int, fmpy: Any, tmp_path: Path
 ) -> None:
     """Each is told at every millisecond what the others' outputs were so long ago."""
-    system = compiled(text)
-    course = apc.simulate(system, duration="0.2 s", jit=False)
-    names = [f"{group.name}[{k + 1}]" for group in system.groups for k in range(group.count)]
+    model = compiled(text)
+    course = apc.simulate(model, duration="0.2 s", jit=False)
+    names = [f"{group.name}[{k + 1}]" for group in model.groups for k in range(group.count)]
     running = {}
     for name in names:
         path, unit = written(text, tmp_path, peer=name)

@@ -60,11 +60,11 @@ links: {lan: {clock: network, delay: 8 ms}}
 """
 
 
-def worst(system: apc.Model, seconds: float, method: str | None = None) -> float:
+def worst(model: apc.Model, seconds: float, method: str | None = None) -> float:
     """Play a topology by Rumoca and by apc; return how far states are apart, of the largest of each kind."""
     rumoca = import_module("rumoca")
-    made = modelica(system)
-    played = apc.simulate(system, duration=f"{seconds} s", jit=False, method=method)
+    made = modelica(model)
+    played = apc.simulate(model, duration=f"{seconds} s", jit=False, method=method)
     step = float(played.time[-1] - played.time[-2])
     config = rumoca.SimConfig(solver="rk-like", rtol=1e-10, atol=1e-13, dt=step / 4)
     found: Any = rumoca.Session().loads(made.text, model=made.name).simulate(t=(0, seconds), config=config)
@@ -109,14 +109,14 @@ def test_rumoca_plays_the_papers_topology_at_any_times_as_simulate_does(times: s
     ],
 )
 def test_rumoca_plays_topologies_of_the_library_as_simulate_does(name: str, settings: dict[str, str]) -> None:
-    system = apc.set_parameters(apc.compile(TOPOLOGIES / f"{name}.yaml"), settings)
-    assert worst(system, 0.06) < 1e-7  # what switches in time is found by each to its own tolerance
+    model = apc.set_parameters(apc.compile(TOPOLOGIES / f"{name}.yaml"), settings)
+    assert worst(model, 0.06) < 1e-7  # what switches in time is found by each to its own tolerance
 
 
 @needs_rumoca
 def test_rumoca_plays_contacts_that_are_not_linear_as_simulate_does() -> None:
-    system = compiled(POUND)
-    assert worst(system, 0.06, "cvodes:1e-10") < 1e-7
+    model = compiled(POUND)
+    assert worst(model, 0.06, "cvodes:1e-10") < 1e-7
 
 
 HANDS = {

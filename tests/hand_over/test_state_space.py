@@ -62,10 +62,10 @@ def magnitudes(matrix: Floats) -> Floats:
     return np.sort(np.abs(np.linalg.eigvals(matrix)))[::-1]
 
 
-def cuts(system: apc.Model) -> list[str]:
+def cuts(model: apc.Model) -> list[str]:
     """Return all that a topology can be cut at."""
-    forces = {hold.name.rpartition(".")[0] for peer_type in system.peer_types for hold in peer_type.holds}
-    return [*(link.name for link in system.links), *sorted(forces)]
+    forces = {hold.name.rpartition(".")[0] for peer_type in model.peer_types for hold in peer_type.holds}
+    return [*(link.name for link in model.links), *sorted(forces)]
 
 
 @pytest.mark.few(4)
@@ -107,9 +107,9 @@ def test_python_control_finds_the_poles_and_margins_that_apc_finds() -> None:
     closed = control.feedback(opened, np.eye(opened.ninputs))
     poles = np.sort(np.abs(closed.poles()))[::-1]
     assert poles[:2] == pytest.approx([1.0, apc.analyze(made("average")).spectral_radius], abs=1e-11)
-    system = compiled(HELD)
-    gain, _, crossing, _ = control.margin(state_space(system, open_at="wall").to_control())
-    margin = next(one for one in apc.margins(system).rows if one.parameter == "wall.stiffness")
+    model = compiled(HELD)
+    gain, _, crossing, _ = control.margin(state_space(model, open_at="wall").to_control())
+    margin = next(one for one in apc.margins(model).rows if one.parameter == "wall.stiffness")
     assert gain == pytest.approx(margin.gain_margin, rel=1e-9)
     assert crossing / (2 * np.pi) == pytest.approx(margin.frequency_hz, rel=1e-9)
 
@@ -135,9 +135,9 @@ PUSHED: dict[str, tuple[str, str, str, dict[str, str]]] = {
 def test_its_step_response_is_what_simulate_plays(name: str) -> None:
     topology, group, part, settings = PUSHED[name]
     text = (TOPOLOGIES / f"{topology}.yaml").read_text(encoding="utf-8") + HAND.replace("PART", part)
-    system = apc.set_parameters(compiled(text), settings)
-    found = state_space(system)
-    run = apc.simulate(system, params={f"{group}.hand.force": "1 N"}, duration="0.3 s", jit=False)
+    model = apc.set_parameters(compiled(text), settings)
+    found = state_space(model)
+    run = apc.simulate(model, params={f"{group}.hand.force": "1 N"}, duration="0.3 s", jit=False)
     pushed = [port.name.startswith(f"force on {group}[") and part in port.name for port in found.inputs]
     x, every = np.zeros(len(found.a)), round(found.frame_s / float(run.time[1] - run.time[0]))
     for row in range(0, len(run.time), every):
@@ -262,15 +262,15 @@ FREE = {
 @pytest.mark.parametrize("cut", ["", "link", "coupler"])
 @pytest.mark.parametrize("name", FREE)
 def test_with_a_number_free_it_is_at_each_value_what_it_is_with_that_set(name: str, cut: str) -> None:
-    system = made(name)
-    at = {"": "", "link": cuts(system)[0], "coupler": cuts(system)[-1]}[cut]
-    found = apc.export(system, "npz", symbolic=FREE[name], open_at=at)
+    model = made(name)
+    at = {"": "", "link": cuts(model)[0], "coupler": cuts(model)[-1]}[cut]
+    found = apc.export(model, "npz", symbolic=FREE[name], open_at=at)
     assert isinstance(found, StateSpace)
-    now = {one.name: one.value for one in system.parameters}
+    now = {one.name: one.value for one in model.parameters}
     for factor in (1.0, 1.7, 30.0):
         values = [(now[label.removeprefix("near.")] or 1.0) * factor for label in FREE[name]]
         texts = [f"{value!r} {port.unit}" for value, port in zip(values, found.symbolic, strict=True)]
-        changed = apc.set_parameters(system, dict(zip(FREE[name], texts, strict=True)))
+        changed = apc.set_parameters(model, dict(zip(FREE[name], texts, strict=True)))
         there = state_space(changed, open_at=found.open_at)
         for one, other in zip(found.function(*values), there.matrices, strict=True):
             assert np.abs(np.array(one) - other).max() <= 1e-12 * max(1.0, np.abs(other).max())

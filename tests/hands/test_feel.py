@@ -154,8 +154,8 @@ def test_a_network_feels_viscous_by_as_much_as_dampers_lack(text: str, received:
     Each user has 5 N·s/m at the device and 5 at the copy, and 150 N/m to each other that is heard or to their
     mean. The formula is the first order in the age of what is heard; the rest is some 0.3 %.
     """
-    system = compiled(replaced(text, ("count: 3", f"count: {count}"), ("stiffness: 500", "stiffness: 150")))
-    found = apc.transparency(system, [1.0])
+    model = compiled(replaced(text, ("count: 3", f"count: {count}"), ("stiffness: 500", "stiffness: 150")))
+    found = apc.transparency(model, [1.0])
     assert found.low_frequency is not None and found.network_damping is not None
     network, off = found.network_damping.network, found.network_damping.error
     assert abs(found.low_frequency.damping - 10.0 * count - network) <= off + found.low_frequency.errors[1]

@@ -53,7 +53,7 @@ def half_a_tick_later(ticks: int) -> float:
 
 
 @pytest.mark.parametrize(
-    ("system", "needed"),
+    ("model", "needed"),
     [
         # b = K (T/2 + delay), for any delay in ticks; b > K T/2 + |B| (Colgate and Schenkel, 1997).
         *((sampled_wall(ticks), 800 * (0.5e-3 + ticks * 1e-3)) for ticks in (0, 1, 2, 5, 17)),
@@ -61,8 +61,8 @@ def half_a_tick_later(ticks: int) -> float:
         *((wall(1.0, 0.8, 0.0, 500.0, virtual), 0.25 + virtual) for virtual in (0.0, 0.1, 0.3, 0.7)),
     ],
 )
-def test_a_wall_needs_the_damping_of_its_closed_form(system: Model, needed: float) -> None:
-    (mode,) = apc.absolute_stability(system).modes
+def test_a_wall_needs_the_damping_of_its_closed_form(model: Model, needed: float) -> None:
+    (mode,) = apc.absolute_stability(model).modes
     assert mode.needed == pytest.approx(needed, rel=1e-9)
     assert mode.passive is (needed < mode.damping)
 
@@ -124,10 +124,10 @@ def random_users(noise: np.random.Generator) -> Model:
     )
 
 
-def shaken(system: Model, hands: np.ndarray) -> bool:
+def shaken(model: Model, hands: np.ndarray) -> bool:
     """Say whether a topology is unstable with any of these (mass, damping, stiffness) at every device."""
     names = ("hand.mass", "hand.damping", "hand.stiffness")
-    many = apc.analyze_many(apc.with_hands(system, "held"), dict(zip(names, hands.T, strict=True)))
+    many = apc.analyze_many(apc.with_hands(model, "held"), dict(zip(names, hands.T, strict=True)))
     return bool((many.stable == 0).any())
 
 
@@ -142,35 +142,35 @@ def tuned(found: AbsoluteStability) -> np.ndarray:
 def test_no_passive_hand_shakes_what_is_called_passive_and_a_tuned_one_what_is_not() -> None:
     noise, passive, tried, struck, topologies = np.random.default_rng(1), 0, 0, 0, 30
     for _ in range(topologies):
-        system = random_users(noise)
-        found = absolute_stability(numeric_model(system))
+        model = random_users(noise)
+        found = absolute_stability(numeric_model(model))
         assert found.stable is not None
-        assert found.clamped_stable is apc.analyze(apc.with_hands(system, "clamped")).stable
+        assert found.clamped_stable is apc.analyze(apc.with_hands(model, "clamped")).stable
         if found.stable:
             passive += 1
-            assert not shaken(system, 10 ** noise.uniform(-6, [3, 4, 7], size=(20, 3)))
+            assert not shaken(model, 10 ** noise.uniform(-6, [3, 4, 7], size=(20, 3)))
         elif found.worst_mode is not None and found.worst_mode.more is not None:
             tried += 1
-            struck += shaken(system, tuned(found))
+            struck += shaken(model, tuned(found))
             # With so much more damping at each device no hand can, with less some still do.
             for part in (0.999, 1.001):
                 value = found.worst_mode.damping + part * found.worst_mode.more
-                more = apc.set_parameters(system, {"device.damping": f"{value!r} N*s/m"})
+                more = apc.set_parameters(model, {"device.damping": f"{value!r} N*s/m"})
                 assert absolute_stability(numeric_model(more)).stable is (part > 1)
     assert min(passive, tried) >= topologies // 8  # or the draws would say nothing
     assert struck >= 0.7 * tried  # some need more than a mass and a spring
 
 
-def by_critical(system: Model, limit: float) -> None:
-    (crossing,) = apc.critical(system, PULL, criterion="passive").crossings
+def by_critical(model: Model, limit: float) -> None:
+    (crossing,) = apc.critical(model, PULL, criterion="passive").crossings
     assert crossing.value == pytest.approx(limit, rel=5e-7)
     assert crossing.error < 3e-9 * limit
     assert str(crossing.proof) == "rigorous passivity bounds"
 
 
-def by_certificate(system: Model, limit: float) -> None:
+def by_certificate(model: Model, limit: float) -> None:
     for value, stable in ((limit - 1e-3, True), (limit + 1e-3, False)):
-        at = apc.set_parameters(system, {PULL: f"{value!r} N/m"})
+        at = apc.set_parameters(model, {PULL: f"{value!r} N/m"})
         found = absolute_stability(numeric_model(at), certify=True)
         assert (found.stable, str(found.proof)) == (
             stable,
@@ -178,15 +178,15 @@ def by_certificate(system: Model, limit: float) -> None:
         )
 
 
-def by_sweep(system: Model, limit: float) -> None:
-    found = apc.sweep(system, {PULL: f"{limit - 1e-3},{limit + 1e-3} N/m"}, criterion="passive", jobs=1)
+def by_sweep(model: Model, limit: float) -> None:
+    found = apc.sweep(model, {PULL: f"{limit - 1e-3},{limit + 1e-3} N/m"}, criterion="passive", jobs=1)
     assert found.column("verdict").tolist() == [PassivityVerdict.STABLE, PassivityVerdict.UNSTABLE]
 
 
-def by_region(system: Model, limit: float) -> None:
+def by_region(model: Model, limit: float) -> None:
     """Also from where nothing holds the copies, and there is no map."""
     x, y = "contact.stiffness=0 N/m:1200 N/m", f"{PULL}=0 N/m:600 N/m"
-    found = apc.region(system, x=x, y=y, criterion="passive")
+    found = apc.region(model, x=x, y=y, criterion="passive")
     sides = [found.contains(1000.0, limit + by) for by in (-1, 1)]
     assert sides == [True, False] and "any passive operator" in str(found)
 
@@ -253,13 +253,13 @@ def test_no_damping_helps_where_a_velocity_is_sampled() -> None:
 def test_no_damping_helps_where_peers_feel_each_other_otherwise_than_springs_do() -> None:
     """Each hears one other, in a circle: what devices feel at rest is no spring's, however it is weighed."""
     graph = "delay: 8 ms, graph: {arcs: [[1, 2, 1], [2, 3, 1], [3, 1, 1]]}}"
-    system = users(3, 100, AVERAGE, ("delay: 8 ms}", graph))
+    model = users(3, 100, AVERAGE, ("delay: 8 ms}", graph))
     for damping in ("5 N*s/m", "500 N*s/m"):
-        found = apc.absolute_stability(system, params={"device.damping": damping})
+        found = apc.absolute_stability(model, params={"device.damping": damping})
         assert (found.stable, found.clamped_stable) == (False, True)
         assert found.worst_mode is not None and found.worst_mode.more is None
         assert "are not conservative" in str(found)
-    answer = apc.critical(system, "device.damping", criterion="passive")
+    answer = apc.critical(model, "device.damping", criterion="passive")
     assert str(answer.verdict).startswith("unstable at every value (reason: apc analyze --hands passive)")
 
 
@@ -274,11 +274,11 @@ def test_where_one_is_pulled_harder_than_it_pulls_hands_by_themselves_do_no_harm
     change: tuple[str, str],
 ) -> None:
     """What devices feel at rest is that of springs if energies are weighed: no hand alone gets any out."""
-    system = users(4, 100, AVERAGE, change)
-    found = apc.absolute_stability(system)
+    model = users(4, 100, AVERAGE, change)
+    found = apc.absolute_stability(model)
     assert found.stable and not found.joined
     assert "independent passive operators" in " ".join(str(found).split())
-    assert not shaken(system, 10 ** np.random.default_rng(3).uniform(-6, [3, 4, 7], size=(60, 3)))
+    assert not shaken(model, 10 ** np.random.default_rng(3).uniform(-6, [3, 4, 7], size=(60, 3)))
 
 
 @pytest.mark.whole
@@ -326,11 +326,11 @@ def test_a_star_of_unlike_users_is_passive_up_to_what_rounding_hides_of_its_symm
 
 def test_two_devices_coupled_directly_are_held_each_at_its_only_mass() -> None:
     """Slow motions need (b₁ − K d)(b₂ − K d) ≥ (K D)², own forces d = 1.5 ms late, the other's D = 21 ms."""
-    system = compiled(DIRECT)
-    found = apc.critical(system, PULL, criterion="passive").value
+    model = compiled(DIRECT)
+    found = apc.critical(model, PULL, criterion="passive").value
     slow = float(np.roots([1.5e-3**2 - 21e-3**2, -12 * 1.5e-3, 20]).max())
     assert found is not None and 0.99 * slow < found <= slow
-    below = apc.set_parameters(system, {PULL: f"{0.99 * found!r} N/m"})
+    below = apc.set_parameters(model, {PULL: f"{0.99 * found!r} N/m"})
     assert not shaken(below, 10 ** np.random.default_rng(3).uniform(-6, [3, 4, 7], size=(100, 3)))
     assert apc.transparency(below, [0.01]).low_frequency.damping > 12
 
@@ -346,12 +346,12 @@ def test_in_a_plane_every_direction_is_held() -> None:
 
 
 def test_a_server_without_a_device_is_not_held() -> None:
-    system = apc.compile(TOPOLOGIES / "client-server.yaml")
-    found = apc.critical(system, "contact.stiffness", criterion="passive").value
+    model = apc.compile(TOPOLOGIES / "client-server.yaml")
+    found = apc.critical(model, "contact.stiffness", criterion="passive").value
     assert found is not None
     hands = 10 ** np.random.default_rng(3).uniform(-6, [3, 4, 7], size=(100, 3))
     for part in (0.99, 1.01):
-        at = apc.set_parameters(system, {"contact.stiffness": f"{part * found!r} N/m"})
+        at = apc.set_parameters(model, {"contact.stiffness": f"{part * found!r} N/m"})
         reported = absolute_stability(numeric_model(at))
         assert reported.stable is (part < 1)
         assert shaken(at, hands if reported.stable else tuned(reported)) is (part > 1)
@@ -514,9 +514,9 @@ def test_what_a_hand_holds_is_named_by_the_line_of_the_message(hands: str, tmp_p
     fix = refused.value.mistakes[0].fix
     assert fix == "hands: {grip: {type: ConstantForce, flange: device, force: 0 N}}"
     path.write_text(f"{TWO_MASSES}{fix}\n", encoding="utf-8")
-    system = apc.compile(path)
-    assert with_hands(system, hands).peer_types
-    (mode,) = apc.absolute_stability(system).modes
+    model = apc.compile(path)
+    assert with_hands(model, hands).peer_types
+    (mode,) = apc.absolute_stability(model).modes
     assert mode.needed == pytest.approx(1000 * 1e-3 / 2, rel=1e-4)
 
 

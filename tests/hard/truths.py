@@ -38,11 +38,11 @@ def main() -> None:
     TRUTHS.write_text(json.dumps(found, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
 
 
-def truth_of(system: Model) -> dict[str, Any]:
+def truth_of(model: Model) -> dict[str, Any]:
     """Return the radius (rigid modes left out), how many rigid modes there are, and the verdict."""
-    truth = spectral_truth(system)
+    truth = spectral_truth(model)
     assert isinstance(truth, Truth), truth
-    chains = _chains(system)
+    chains = _chains(model)
     if truth.radius > 1:
         verdict = "unstable"
     elif chains:
@@ -52,11 +52,11 @@ def truth_of(system: Model) -> dict[str, Any]:
     return {"spectral_radius": truth.digits, "rigid_modes": truth.rigid - chains, "verdict": verdict}
 
 
-def _chains(system: Model) -> int:
+def _chains(model: Model) -> int:
     """Return how many of the eigenvalues 1 have no vector of their own that stands still."""
     missing = 0
     with precision(1024):
-        for _, count, matrix in frame_matrices(system, classes_of(system)):
+        for _, count, matrix in frame_matrices(model, classes_of(model)):
             n = matrix.nrows()
             held = sum(float(abs(value - 1).mid()) < RIGID for value in eigenvalues(matrix))
             rows = [[matrix[i, j].mid() - (i == j) for j in range(n)] for i in range(n)]

@@ -47,6 +47,6 @@ def model(folder: Path, *equations: str, variables: str = "", more: str = "") ->
     return compiled(topology(text, more), library(folder, text))
 
 
-def force(system: apc.Model, x: float = 0.0, v: float = 0.0) -> float:
+def force(model: apc.Model, x: float = 0.0, v: float = 0.0) -> float:
     """Return the force of the component on the mass there: 2 kg times its acceleration, and its damping."""
-    return 2 * rates(system, {"device.x": x, "device.v": v})["device.v"] + 3 * v
+    return 2 * rates(model, {"device.x": x, "device.v": v})["device.v"] + 3 * v

@@ -28,14 +28,14 @@ def filtered(folder: Path, *equations: str) -> apc.Model:
 
 
 def test_a_value_of_the_tick_before_is_a_memory_that_starts_as_is_said(tmp_path: Path) -> None:
-    system = filtered(tmp_path, "s = 0.5*previous(s) + sample(flange.x)", "w = 2*s", "k*hold(s)")
-    [peer_type] = system.peer_types
+    model = filtered(tmp_path, "s = 0.5*previous(s) + sample(flange.x)", "w = 2*s", "k*hold(s)")
+    [peer_type] = model.peer_types
     [tick] = peer_type.clocks
     assert (tick.outputs, tick.memories, tick.starts) == (("all.s",), (0,), ("all.s",))
-    assert ticked(system, {"device.x": 0.25}, [3.0]) == {"all.s": 1.75}
-    p = [values(system)[name] for name in peer_type.parameters]
+    assert ticked(model, {"device.x": 0.25}, [3.0]) == {"all.s": 1.75}
+    p = [values(model)[name] for name in peer_type.parameters]
     assert listed(peer_type.derivative([0, 0], [0.5], p, 0)) == [0, -9 * 0.5 / 2]
-    assert values(system)["all.s"] == 0.002
+    assert values(model)["all.s"] == 0.002
 
 
 # ---- what is heard ----
@@ -65,21 +65,21 @@ REDUCTIONS = {
 def test_a_linear_reduction_of_the_others_is_one_of_what_they_send(
     force: str, expected: float, tmp_path: Path
 ) -> None:
-    system = compiled(FOUR, library(tmp_path, FOLLOWER.format(force)))
+    model = compiled(FOUR, library(tmp_path, FOLLOWER.format(force)))
     received = {"mean": 0.25, "sum": 0.75, "count": 3.0}
-    receives = system.peer_types[0].clocks[0].receives
+    receives = model.peer_types[0].clocks[0].receives
     assert all(one.edge is None for one in receives)
-    found = ticked(system, {"device.x": 0.5}, (), [received[one.operator] for one in receives])
+    found = ticked(model, {"device.x": 0.5}, (), [received[one.operator] for one in receives])
     assert list(found.values()) == [pytest.approx(expected, rel=1e-14)]
 
 
 def test_a_reduction_that_is_not_linear_is_taken_over_each_pair(tmp_path: Path) -> None:
     """Three others at rest beside one who is 10 mm off pull by what max leaves, each by itself."""
     own = library(tmp_path, FOLLOWER.format("k*sum(max(sample(flange.x) - others.x, 0))"))
-    system = compiled(replaced(FOUR, ("count: 4", "count: 4, set: {device.x: [10 mm, 0 m, 0 m, 0 m]}")), own)
-    [receive] = system.peer_types[0].clocks[0].receives
+    model = compiled(replaced(FOUR, ("count: 4", "count: 4, set: {device.x: [10 mm, 0 m, 0 m, 0 m]}")), own)
+    [receive] = model.peer_types[0].clocks[0].receives
     assert (receive.operator, receive.link, receive.edge is None) == ("sum", "lan", False)
-    run = apc.simulate(system, duration="2 ms", signals=["*.v"], jit=False)
+    run = apc.simulate(model, duration="2 ms", signals=["*.v"], jit=False)
     assert run["user[1].device.v"][1] == pytest.approx(-7 * 3 * 0.010 / 2 * 1e-3, rel=1e-2)
     assert [run[f"user[{peer}].device.v"][1] for peer in (2, 3, 4)] == [0, 0, 0]
 

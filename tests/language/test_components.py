@@ -38,15 +38,15 @@ def test_a_file_is_named_after_what_it_defines_in_kebab_case(path: Path) -> None
 def test_a_folder_of_ones_own_comes_before_the_library(tmp_path: Path) -> None:
     own = library(tmp_path, BALL.replace("Ball", "Mass"), BALL)
     masses = "masses: {device: {type: Mass}, ball: {type: Ball}}\n"
-    system = compiled(f"topology: own\npeers: {{u: {{count: 1}}}}\n{masses}", own)
-    assert "device.damping" not in values(system)
-    assert apc.analyze(system).rigid_modes == 2
+    model = compiled(f"topology: own\npeers: {{u: {{count: 1}}}}\n{masses}", own)
+    assert "device.damping" not in values(model)
+    assert apc.analyze(model).rigid_modes == 2
 
 
 def test_a_bare_number_of_a_declaration_is_in_the_unit_beside_it(tmp_path: Path) -> None:
     text = "topology: own\npeers: {u: {count: 1}}\nmasses: {ball: {type: Ball}}\n"
-    system = compiled(text, library(tmp_path, BALL))
-    [mass] = [one for one in system.parameters if one.name == "ball.mass"]
+    model = compiled(text, library(tmp_path, BALL))
+    [mass] = [one for one in model.parameters if one.name == "ball.mass"]
     assert (mass.minimum, mass.exclusive_minimum, mass.maximum, mass.value) == (0.001, True, 2.0, 0.5)
     [line] = messages_of(
         compiled, text.replace("type: Ball", "type: Ball, mass: 1 g"), library(tmp_path, BALL)

@@ -20,8 +20,8 @@ from tests.topologies import AVERAGE, ONE_MASS, compiled, library, replaced
 def parameters(*texts: str, before: str = "") -> list[Fraction | float]:
     """Return what expressions of parameters come to in a topology: a fraction where it is exact."""
     named = ", ".join(f"p{place}: '{text}'" for place, text in enumerate(texts))
-    system = compiled(f"{ONE_MASS}parameters: {{{before}{named}}}\n")
-    found = {one.name: one.value if one.exact is None else one.exact for one in system.parameters}
+    model = compiled(f"{ONE_MASS}parameters: {{{before}{named}}}\n")
+    found = {one.name: one.value if one.exact is None else one.exact for one in model.parameters}
     return [found[f"p{place}"] for place in range(len(texts))]
 
 
@@ -82,12 +82,12 @@ TERMS = {
 @pytest.mark.parametrize("term", TERMS)
 def test_every_function_of_the_language_has_its_meaning_and_its_slope(term: str, tmp_path: Path) -> None:
     equations = ["x = flange.x/L", f"y = {term}", "s = T*sample(der(y))", "flange.f = -F*y - hold(F*s)"]
-    system, value = model(tmp_path, *equations), TERMS[term]
+    compiled_model, value = model(tmp_path, *equations), TERMS[term]
     for x in (-1.5, 0.5, 1.0, 2.5, 3.0):
-        assert force(system, x) == pytest.approx(value(x), rel=1e-14), x
+        assert force(compiled_model, x) == pytest.approx(value(x), rel=1e-14), x
     for x in (-1.5, 0.5, 2.5):
         slope = (value(x + 1e-6) - value(x - 1e-6)) / 2e-6
-        for held in ticked(system, {"device.x": x, "device.v": 0.5}).values():
+        for held in ticked(compiled_model, {"device.x": x, "device.v": 0.5}).values():
             assert held == pytest.approx(0.5 * slope, rel=1e-7, abs=1e-9), x
 
 
@@ -111,7 +111,7 @@ def test_an_expression_and_its_derivative_mean_what_is_written(seed: int, tmp_pa
     """By mpmath: the force is the expression, what is held at a tick its derivative, by the chain rule."""
     text = _random(random.Random(seed), 3)
     equations = ["x = flange.x/L", f"y = {text}", "s = T*sample(der(y))", "flange.f = -F*y - hold(F*s)"]
-    system = model(tmp_path, *equations)
+    compiled_model = model(tmp_path, *equations)
     names = ("sin", "cos", "tanh", "atan", "sqrt", "log", "exp", "atan2")
     known = {name: getattr(mpmath, name) for name in names}
 
@@ -121,8 +121,8 @@ def test_an_expression_and_its_derivative_mean_what_is_written(seed: int, tmp_pa
     for x in (0.2, 0.9, 2.0):
         with mpmath.workdps(30):
             expected, slope = value(mpmath.mpf(x)), mpmath.diff(value, x)
-        assert force(system, x) == pytest.approx(float(expected), rel=1e-12, abs=1e-12)
-        for held in ticked(system, {"device.x": x, "device.v": 0.5}).values():
+        assert force(compiled_model, x) == pytest.approx(float(expected), rel=1e-12, abs=1e-12)
+        for held in ticked(compiled_model, {"device.x": x, "device.v": 0.5}).values():
             assert held == pytest.approx(0.5 * float(slope), rel=1e-11, abs=1e-11)
 
 
@@ -132,12 +132,12 @@ def test_what_follows_from_others_keeps_its_text_and_follows() -> None:
         ("clocks:", "parameters: {half: whole/2, whole: 2 N/mm}\nclocks:"),
         ("500 N/m,", "half/(peers - 1),"),
     )
-    system = compiled(text)
-    found = {one.name: one for one in system.parameters}
+    model = compiled(text)
+    found = {one.name: one for one in model.parameters}
     assert (found["half"].exact, found["coordination.stiffness"].exact) == (1000, 500)
     formula = found["coordination.stiffness"].formula
     assert formula is not None and formula.text == "half/(peers - 1)"
-    assert set(system.followers) == {"half", "coordination.stiffness"}
+    assert set(model.followers) == {"half", "coordination.stiffness"}
 
 
 NAMED = """\

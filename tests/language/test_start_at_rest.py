@@ -32,24 +32,24 @@ def _pressed(push: str = "0 N", held: str = "0 N", left: str = "device.x: -180 m
 
 
 def test_the_largest_force_that_nothing_balances_is_told_first_of_all() -> None:
-    system = compiled(_pressed())
-    first, second = apc.analyze(system).limitations
+    model = compiled(_pressed())
+    first, second = apc.analyze(model).limitations
     assert first.startswith("the initial state is not at rest: 120 N acts on left.")
     assert "nonlinear topology" in second
     assert (
-        str(apc.analyze(system)).splitlines()[1].strip().startswith("the initial state is not at rest: 120 N")
+        str(apc.analyze(model)).splitlines()[1].strip().startswith("the initial state is not at rest: 120 N")
     )
-    assert apc.analyze(system).to_dict()["limitations"] == [first, second]
+    assert apc.analyze(model).to_dict()["limitations"] == [first, second]
 
 
 def test_every_answer_that_holds_near_the_start_says_what_moves_there() -> None:
-    system = compiled(_pressed())
+    model = compiled(_pressed())
     x, y = "contact.stiffness=500 N/m:700 N/m", "device.damping=4 N*s/m:6 N*s/m"
     found = (
-        apc.critical(system, "contact.stiffness"),
-        apc.transparency(system, [1.0], at="left[1].device", between="right[1].device"),
-        apc.region(system, x=x, y=y),
-        apc.analyze_many(system, {"contact.stiffness": [500.0]}),
+        apc.critical(model, "contact.stiffness"),
+        apc.transparency(model, [1.0], at="left[1].device", between="right[1].device"),
+        apc.region(model, x=x, y=y),
+        apc.analyze_many(model, {"contact.stiffness": [500.0]}),
     )
     for one in found:
         assert one.limitations[0].startswith("the initial state is not at rest: 120 N acts on left.")

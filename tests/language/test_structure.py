@@ -20,38 +20,43 @@ ROW = "  load: {mass: 5 kg, damping: 1 N*s/m"
 
 def only(text: str, speed: float) -> tuple[list[str], dict[str, float]]:
     """Return the states of a topology and the rates where its only velocity is such."""
-    system = compiled(text)
-    states = [state.name for state in system.peer_types[0].states]
+    model = compiled(text)
+    states = [state.name for state in model.peer_types[0].states]
     velocity = {name: speed for name in states if name.endswith(".v")}
-    return states, rates(system, velocity)
+    return states, rates(model, velocity)
 
 
 def test_masses_joined_the_other_way_round_have_opposite_velocities(tmp_path: Path) -> None:
     reversed_ = "component: Lever\nconnectors: {a: Flange, b: Flange}\nequations: [a.x = -b.x, a.f = b.f]\n"
     text = f"{ONE_MASS}{ROW}}}\ncouplers: {{lever: {{type: Lever, a: device, b: load}}}}\n"
     text += "hands: {push: {type: ConstantForce, flange: device, force: 4 N}}\n"
-    system = compiled(text, library(tmp_path, reversed_))
-    [position, velocity] = [state.name for state in system.peer_types[0].states]
+    model = compiled(text, library(tmp_path, reversed_))
+    [position, velocity] = [state.name for state in model.peer_types[0].states]
     sign = 1 if velocity == "device.v" else -1
-    found = rates(system, {velocity: 0.5})
+    found = rates(model, {velocity: 0.5})
     assert [found[position], found[velocity]] == pytest.approx([0.5, (sign * 4 - 4 * 0.5) / 7], rel=1e-14)
 
 
 @pytest.mark.parametrize("position", ["0*L", "L", "L*sin(time/T)", "L*(time/T)^2"])
 def test_what_is_told_where_to_be_has_no_state_and_plays(position: str, tmp_path: Path) -> None:
-    system = model(tmp_path, f"flange.x = {position}")
-    assert system.peer_types[0].states == ()
-    found = apc.analyze(system)
+    compiled_model = model(tmp_path, f"flange.x = {position}")
+    assert compiled_model.peer_types[0].states == ()
+    found = apc.analyze(compiled_model)
     assert (found.verdict, found.spectral_radius) == ("stable", 0)
-    assert apc.simulate(system, duration="20 ms", jit=False).time[-1] == pytest.approx(0.02)
+    assert apc.simulate(compiled_model, duration="20 ms", jit=False).time[-1] == pytest.approx(0.02)
 
 
 def test_a_second_derivative_takes_the_velocity_that_is_named_as_its_state(tmp_path: Path) -> None:
-    system = model(
+    compiled_model = model(
         tmp_path, "K*T^2*der(der(y)) = F - K*T*der(y)", "der(y) = v", "flange.f = 0", variables="y: v=m/s:"
     )
-    assert {one.name for one in system.peer_types[0].states} == {"device.x", "device.v", "own.y", "own.v"}
-    assert rates(system, {"own.v": 1.0})["own.v"] == pytest.approx(0.01 - 1, rel=1e-14)
+    assert {one.name for one in compiled_model.peer_types[0].states} == {
+        "device.x",
+        "device.v",
+        "own.y",
+        "own.v",
+    }
+    assert rates(compiled_model, {"own.v": 1.0})["own.v"] == pytest.approx(0.01 - 1, rel=1e-14)
 
 
 def test_the_derivative_of_a_sampled_algebraic_variable_follows_by_the_chain_rule(tmp_path: Path) -> None:
@@ -61,8 +66,8 @@ def test_the_derivative_of_a_sampled_algebraic_variable_follows_by_the_chain_rul
         "s = sample(der(z))",
         "flange.f = -hold(K*T*s)",
     ]
-    system = model(tmp_path, *equations, variables="y z s=m/s")
-    found = ticked(system, {"device.x": 0.3, "device.v": 0.25})
+    compiled_model = model(tmp_path, *equations, variables="y z s=m/s")
+    found = ticked(compiled_model, {"device.x": 0.3, "device.v": 0.25})
     assert list(found.values()) == pytest.approx([100 * 0.25 * (2 * math.exp(0.6) + 1)], rel=1e-14)
 
 
@@ -78,8 +83,8 @@ def cardano(x: float) -> float:
 
 @pytest.mark.parametrize("x", [-20.0, -1.0, 0.0, 0.3, 2.0, 1e6])
 def test_a_cubic_loop_has_cardanos_root(x: float, tmp_path: Path) -> None:
-    system = model(tmp_path, "y + y^3/L^2 = flange.x", "flange.f = K*y", variables="y")
-    assert -force(system, x) / 100 == pytest.approx(cardano(x), rel=1e-13, abs=1e-13)
+    compiled_model = model(tmp_path, "y + y^3/L^2 = flange.x", "flange.f = K*y", variables="y")
+    assert -force(compiled_model, x) / 100 == pytest.approx(cardano(x), rel=1e-13, abs=1e-13)
 
 
 def test_a_loop_of_several_unknowns_is_solved_and_what_follows_it_is_explicit(tmp_path: Path) -> None:
@@ -115,9 +120,9 @@ def test_linear_loops_have_the_solution_numpy_finds(size: int, tmp_path: Path) -
     equations = [f"{row} = {b}*p*flange.x" for row, b in zip(rows, right, strict=True)]
     summed = " + ".join(f"{3**i}*x{i}" for i in range(size))
     names = " ".join(f"x{i}" for i in range(size))
-    system = model(tmp_path, *equations, f"flange.f = K*({summed})", variables=names)
+    compiled_model = model(tmp_path, *equations, f"flange.f = K*({summed})", variables=names)
     expected = 100 * 3.0 ** np.arange(size) @ np.linalg.solve(matrix, right)
-    assert -force(system, 1.0) == pytest.approx(expected, rel=1e-12)
+    assert -force(compiled_model, 1.0) == pytest.approx(expected, rel=1e-12)
 
 
 @pytest.mark.parametrize("p", [0, 0.5])
@@ -129,10 +134,13 @@ def test_a_pivot_is_a_number_where_there_is_one(p: float, tmp_path: Path) -> Non
 
 
 def test_a_loop_through_a_condition_that_is_known_stays_linear(tmp_path: Path) -> None:
-    system = model(
+    compiled_model = model(
         tmp_path, "y = if flange.x > 0 then p*(y - L) + flange.x else 0", "flange.f = K*y", variables="y"
     )
-    assert [-force(system, x) / 100 for x in (2.0, -2.0)] == [pytest.approx(1.75 / 0.75, rel=1e-14), 0]
+    assert [-force(compiled_model, x) / 100 for x in (2.0, -2.0)] == [
+        pytest.approx(1.75 / 0.75, rel=1e-14),
+        0,
+    ]
 
 
 ZERO = (Path(__file__).parent / "zero.txt").read_text(encoding="utf-8").splitlines()

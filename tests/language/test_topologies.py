@@ -31,11 +31,9 @@ def changed(*pairs: tuple[str, str]) -> apc.Model:
     return compiled(replaced(AVERAGE, *pairs))
 
 
-def exact(system: apc.Model) -> dict[str, Any]:
+def exact(model: apc.Model) -> dict[str, Any]:
     """Return the exact numbers and times of a topology by name."""
-    return {one.name: one.exact for one in system.parameters} | {
-        one.name: one.value for one in system.timings
-    }
+    return {one.name: one.exact for one in model.parameters} | {one.name: one.value for one in model.timings}
 
 
 # ---- numbers ----
@@ -43,10 +41,10 @@ def exact(system: apc.Model) -> dict[str, Any]:
 
 @pytest.mark.parametrize(("text", "weight"), [(AVERAGE, 1), (MESH, 2)])
 def test_the_functions_give_the_papers_equations(text: str, weight: int) -> None:
-    system = compiled(replaced(text, ("500 N/m,", "500 N/m, damping: 2 N*s/m,")))
-    [peer_type] = system.peer_types
+    model = compiled(replaced(text, ("500 N/m,", "500 N/m, damping: 2 N*s/m,")))
+    [peer_type] = model.peer_types
     [haptic], [lan] = peer_type.clocks, peer_type.sends
-    known = values(system)
+    known = values(model)
     p = [known[name] for name in peer_type.parameters]
     x, v, x_o, v_o = state = [0.01, -0.2, 0.03, 0.5]
     held_contact, held_pull = held = [3.0, -7.0]
@@ -102,19 +100,19 @@ SHAKEN += "frequency: FREQUENCY, phase: 90 deg}}\n"
 
 @pytest.mark.parametrize("written", ["w/(2*pi)", "(w + w)/(2*pi)/2", "f/pi", "2*(f + f)/pi - f/pi - 2*f/pi"])
 def test_a_name_keeps_what_its_unit_counts(written: str) -> None:
-    system = compiled(ONE_MASS + SHAKEN.replace("FREQUENCY", written))
-    units = {one.name: one.unit for one in system.parameters}
+    model = compiled(ONE_MASS + SHAKEN.replace("FREQUENCY", written))
+    units = {one.name: one.unit for one in model.parameters}
     shown = ("Hz", "rad/s", "Hz", "rad")
     assert tuple(units[name] for name in ("f", "w", "push.frequency", "push.phase")) == shown
-    assert values(system)["push.frequency"] == pytest.approx(2 / math.pi)
+    assert values(model)["push.frequency"] == pytest.approx(2 / math.pi)
 
 
 def test_an_experiment_and_the_axes_of_a_study_are_kept() -> None:
-    system = changed(("studies:", "experiment: {duration: 3 s, seed: 7}\nstudies:"))
-    assert (system.experiment.duration, system.experiment.seed) == (3, 7)
+    model = changed(("studies:", "experiment: {duration: 3 s, seed: 7}\nstudies:"))
+    assert (model.experiment.duration, model.experiment.seed) == (3, 7)
     assert (compiled(ONE_MASS).experiment.duration, compiled(ONE_MASS).experiment.seed) == (None, 0)
     axes = [("contact.stiffness", 0, 5000), ("coordination.stiffness", 0, 1500)]
-    assert [(one.parameter, one.low, one.high) for one in system.region] == axes
+    assert [(one.parameter, one.low, one.high) for one in model.region] == axes
 
 
 @pytest.mark.parametrize(
@@ -159,10 +157,10 @@ def test_a_trace_is_a_column_of_delays_lost_ones_infinite_and_stays_in_the_model
     ):
         (tmp_path / "delays.csv").write_text(cells, encoding="utf-8")
         path.write_text(replaced(AVERAGE, ("8 ms}", "8 ms, trace: delays.csv}")), encoding="utf-8")
-        system = apc.compile(path)
-        assert any(name.endswith("delays.csv") for name, _ in system.origin.texts)
-        apc.save(system, tmp_path / "topology.apc")
-        for model in (system, apc.load(tmp_path / "topology.apc")):
+        compiled_model = apc.compile(path)
+        assert any(name.endswith("delays.csv") for name, _ in compiled_model.origin.texts)
+        apc.save(compiled_model, tmp_path / "topology.apc")
+        for model in (compiled_model, apc.load(tmp_path / "topology.apc")):
             assert model.links[0].channel is not None and model.links[0].channel.trace is not None
             assert model.links[0].channel.trace.tolist() == expected
     for more in ("loss: 1 %", "jitter: 1 ms", "delays: {user: {user: 3 ms}}"):
@@ -196,16 +194,16 @@ couplers:
   coordination: {{type: LateMean, object: cube, stiffness: 500 N/m, clock: haptic, link: lan}}
 links: {{lan: {{clock: network, delay: 8 ms}}}}
 """
-    system = compiled(text, library(tmp_path, LATE))
-    assert len(system.peer_types) == 2, "each can be changed on its own"
-    assert exact(system)["two.coordination.lag"] == 5 * MS
+    model = compiled(text, library(tmp_path, LATE))
+    assert len(model.peer_types) == 2, "each can be changed on its own"
+    assert exact(model)["two.coordination.lag"] == 5 * MS
 
 
 def test_a_part_of_another_type_at_a_group_has_the_numbers_of_that_type() -> None:
     text = (TOPOLOGIES / "teleoperation-pair.yaml").read_text("utf-8")
-    system = compiled(text)
-    own = {one.name: one.value for one in system.groups[1].values}
-    known = values(system)
+    model = compiled(text)
+    own = {one.name: one.value for one in model.groups[1].values}
+    known = values(model)
     assert (known["device.force_limit"], own["device.force_limit"]) == (3.3, 12.0)
     assert (known["device.mass"], own["device.mass"]) == (0.1, 0.25)
     # The same as masses, and with the two groups' types changed over.
@@ -214,7 +212,7 @@ def test_a_part_of_another_type_at_a_group_has_the_numbers_of_that_type() -> Non
     over = replaced(
         text, ("count: 1}", leader), ("device.type: Omega3, ", ""), ("type: Touch", "type: Omega3")
     )
-    for other in (system, compiled(over)):
+    for other in (model, compiled(over)):
         assert apc.analyze(other).spectral_radius == pytest.approx(plain.spectral_radius, rel=1e-12)
     with pytest.raises(
         apc.ApcError, match=r"HapticDevice has no force_limit, .* Try: device.force_limit: 1 N"
@@ -232,13 +230,13 @@ def test_a_number_of_another_type_at_a_group_has_the_unit_it_has_elsewhere(tmp_p
 
 
 def test_what_nobody_reads_or_hears_is_left_out_and_said(tmp_path: Path) -> None:
-    system = changed(
+    model = changed(
         ("  network: 8 ms", "  network: 8 ms\n  spare: 3 ms"),
         ("  lan: {", "  wan: {clock: network, loss: 2 %, jitter: 1 ms}\n  lan: {"),
     )
-    assert system.dropped == (("wan", "its packets are not received"), ("spare", "it is not used"))
-    assert [one.name for one in (*system.links, *system.clocks)] == ["lan", "haptic", "network"]
-    assert not [name for name in exact(system) if name.startswith("wan")]
+    assert model.dropped == (("wan", "its packets are not received"), ("spare", "it is not used"))
+    assert [one.name for one in (*model.links, *model.clocks)] == ["lan", "haptic", "network"]
+    assert not [name for name in exact(model) if name.startswith("wan")]
     own = (
         "component: Follower\nconnectors: {flange: Flange}\n"
         "sends: {x: sample(flange.x), same: sample(flange.x), v: sample(der(flange.x))}\n"
@@ -249,11 +247,11 @@ def test_what_nobody_reads_or_hears_is_left_out_and_said(tmp_path: Path) -> None
         "clocks: {tick: 1 ms}\nlinks: {lan: {clock: tick}}\n"
         "couplers: {all: {type: Follower, flange: device, k: 1 N/m, clock: tick, link: lan}}\n"
     )
-    system = compiled(text, library(tmp_path, own))
-    assert system.peer_types[0].sends[0].channels == ("all.x", "all.same")
-    receives = system.peer_types[0].clocks[0].receives
+    model = compiled(text, library(tmp_path, own))
+    assert model.peer_types[0].sends[0].channels == ("all.x", "all.same")
+    receives = model.peer_types[0].clocks[0].receives
     assert [(one.operator, one.channel) for one in receives] == [("mean", 0), ("sum", 1)]
-    assert ("all.v", "it is not received") in system.dropped
+    assert ("all.v", "it is not received") in model.dropped
 
 
 def test_a_held_value_is_sent_though_only_another_kind_of_peer_hears_it(tmp_path: Path) -> None:
@@ -283,11 +281,11 @@ masses: {cube: {mass: 1 kg, damping: 1 N*s/m}}
 couplers: {it: {type: Told, object: cube, stiffness: 50 N/m, gain: 0.5, clock: tick, link: lan}}
 links: {lan: {clock: tick, delay: 2 ms, graph: star}}
 """
-    system = compiled(text, library(tmp_path, component))
-    server, client = system.peer_types
+    model = compiled(text, library(tmp_path, component))
+    server, client = model.peer_types
     [send] = client.sends
     held = [float(one.name == "it.pull") for one in client.holds]
-    p = [values(system)[name] for name in client.parameters]
+    p = [values(model)[name] for name in client.parameters]
     sent = listed(casadi.DM(send.send([0.0] * len(client.states), held, p, 0)))
     assert sent[send.channels.index("it.f")] == 0.5
     assert [one.name for one in server.clocks[0].receives][-1] == "sum(others.it.f)"

@@ -98,8 +98,8 @@ def test_a_unit_is_bounded_in_every_direction(unit: str) -> None:
 
 @pytest.mark.parametrize("text", ["5*1/peers", "1/peers", "5/rate", "1/(rate - 1)"])
 def test_an_operator_behind_a_number_makes_an_expression(text: str) -> None:
-    system = compiled(f"{ONE_MASS}parameters: {{rate: 2, p: {text}}}\n")
-    found = {one.name: one.exact for one in system.parameters}
+    model = compiled(f"{ONE_MASS}parameters: {{rate: 2, p: {text}}}\n")
+    found = {one.name: one.exact for one in model.parameters}
     assert found["p"] == eval(text, {"peers": 1, "rate": Fraction(2)})
 
 

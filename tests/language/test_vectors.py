@@ -43,10 +43,10 @@ def component(text: str, v: list[float]) -> str:
 
 def value(text: str, u: Vector, v: Vector, folder: Path) -> list[float]:
     """Return what a vector of u, where a mass is, and of v, a parameter, comes to: the force on 1 kg."""
-    system = compiled(topology(len(u)), library(folder, component(text, v.tolist())))
+    model = compiled(topology(len(u)), library(folder, component(text, v.tolist())))
     at = {f"device.x[{k + 1}]": float(one) for k, one in enumerate(u)}
     at |= {f"device.v[{k + 1}]": float(one) for k, one in enumerate(2 * u)}
-    found = rates(system, at)
+    found = rates(model, at)
     return [found[f"device.v[{k + 1}]"] for k in range(len(u))]
 
 

@@ -19,16 +19,16 @@ def listed(result: Any) -> list[float]:
     return [float(value) for value in casadi.DM(result).full().ravel()]
 
 
-def values(system: apc.Model) -> dict[str, float]:
-    return {parameter.name: parameter.value for parameter in system.parameters}
+def values(model: apc.Model) -> dict[str, float]:
+    return {parameter.name: parameter.value for parameter in model.parameters}
 
 
-def at(system: apc.Model, x: Mapping[str, float]) -> tuple[list[float], list[float], list[float]]:
+def at(model: apc.Model, x: Mapping[str, float]) -> tuple[list[float], list[float], list[float]]:
     """Return the states, with 0 for those not named, zeros for what is held, and the numbers."""
-    (peer_type,) = system.peer_types
+    (peer_type,) = model.peer_types
     states = [state.name for state in peer_type.states]
     assert set(x) <= set(states)
-    known = values(system)
+    known = values(model)
     return (
         [x.get(one, 0.0) for one in states],
         [0.0] * len(peer_type.holds),
@@ -36,30 +36,30 @@ def at(system: apc.Model, x: Mapping[str, float]) -> tuple[list[float], list[flo
     )
 
 
-def rates(system: apc.Model, x: Mapping[str, float], held: Sequence[float] = ()) -> dict[str, float]:
+def rates(model: apc.Model, x: Mapping[str, float], held: Sequence[float] = ()) -> dict[str, float]:
     """Return dx/dt by state."""
-    (peer_type,) = system.peer_types
-    states, nothing, numbers = at(system, x)
+    (peer_type,) = model.peer_types
+    states, nothing, numbers = at(model, x)
     found = listed(peer_type.derivative(states, list(held) or nothing, numbers, 0.0))
     return dict(zip((state.name for state in peer_type.states), found, strict=True))
 
 
 def ticked(
-    system: apc.Model,
+    model: apc.Model,
     x: Mapping[str, float],
     memory: Sequence[float] = (),
     received: Sequence[float] = (),
 ) -> dict[str, float]:
     """Return what the only clock computes."""
-    ((clock,),) = (peer_type.clocks for peer_type in system.peer_types)
-    states, nothing, numbers = at(system, x)
+    ((clock,),) = (peer_type.clocks for peer_type in model.peer_types)
+    states, nothing, numbers = at(model, x)
     found = listed(clock.tick(states, nothing, list(memory), list(received), numbers, 0))
     return dict(zip(clock.outputs, found, strict=True))
 
 
-def pushes(system: apc.Model, x: Mapping[str, float], held: Sequence[float] = ()) -> list[float]:
+def pushes(model: apc.Model, x: Mapping[str, float], held: Sequence[float] = ()) -> list[float]:
     """Return the force of all parts on each of `MASSES`: m dv/dt + b v."""
-    found = rates(system, x, held)
+    found = rates(model, x, held)
     return [
         mass * found[f"{name}.v"] + damping * x.get(f"{name}.v", 0.0)
         for name, (mass, damping) in MASSES.items()

@@ -59,14 +59,14 @@ TIES: dict[str, tuple[str, Callable[[float, float], float]]] = {
 @pytest.mark.parametrize("name", TIES)
 def test_what_ties_two_masses_pulls_both_by_its_law(name: str, x: float, v: float) -> None:
     words, law = TIES[name]
-    system = coupled(f"type: {name}, a: device, b: load, {words}")
+    model = coupled(f"type: {name}, a: device, b: load, {words}")
     moving = {"device.x": 0.2 + x, "device.v": 3.0 + v, "load.x": 0.2, "load.v": 3.0}
     force = law(x, v)
     if "clock" in words:
-        assert ticked(system, moving) == {"it.f": pytest.approx(force, rel=1e-11, abs=1e-12)}
-        assert pushes(system, {}, [6.0]) == pytest.approx([-6, 6], rel=EXACT)
+        assert ticked(model, moving) == {"it.f": pytest.approx(force, rel=1e-11, abs=1e-12)}
+        assert pushes(model, {}, [6.0]) == pytest.approx([-6, 6], rel=EXACT)
     else:
-        assert pushes(system, moving) == pytest.approx([-force, force], rel=1e-11, abs=1e-12)
+        assert pushes(model, moving) == pytest.approx([-force, force], rel=1e-11, abs=1e-12)
 
 
 def test_a_rigid_bar_halves_the_force_on_its_middle() -> None:
@@ -78,10 +78,10 @@ def test_a_rigid_bar_halves_the_force_on_its_middle() -> None:
 def test_a_gear_multiplies_displacement_and_divides_force() -> None:
     """x_a = 4 x_b: seen at a, the load is 16 times lighter, (2 + 5/16) a'' + (3 + 1/16) a' = F."""
     text = TWO + "couplers:\n  gear: {type: Gear, a: device, b: load, ratio: 4}\n"
-    system = compiled(text + "hands:\n  hand: {type: ConstantForce, flange: device, force: 7 N}\n")
-    speed = next(one.name for one in system.peer_types[0].states if one.name.endswith(".v"))
+    model = compiled(text + "hands:\n  hand: {type: ConstantForce, flange: device, force: 7 N}\n")
+    speed = next(one.name for one in model.peer_types[0].states if one.name.endswith(".v"))
     factor = 1.0 if speed == "device.v" else 0.25
-    found = rates(system, {speed: 0.6 * factor})
+    found = rates(model, {speed: 0.6 * factor})
     assert len(found) == 2
     expected = (7 - (3 + 1 / 16) * 0.6) / (2 + 5 / 16)
     assert found[speed] == pytest.approx(expected * factor, rel=EXACT)
@@ -89,8 +89,8 @@ def test_a_gear_multiplies_displacement_and_divides_force() -> None:
 
 def test_a_finger_is_two_masses_of_which_one_moves_with_the_device() -> None:
     words = "tip_mass: 6 g, bone_mass: 30 g, stiffness: 500 N/m, damping: 2 N*s/m"
-    system = coupled(f"type: Finger, flange: device, {words}", base=ONE_MASS)
-    found = rates(system, {"device.x": 0.001, "device.v": 0.2, "it.bone.x": 0.004, "it.bone.v": -0.1})
+    model = coupled(f"type: Finger, flange: device, {words}", base=ONE_MASS)
+    found = rates(model, {"device.x": 0.001, "device.v": 0.2, "it.bone.x": 0.004, "it.bone.v": -0.1})
     force = 500 * (0.001 - 0.004) + 2 * (0.2 + 0.1)
     assert (found["device.v"], found["it.bone.v"]) == (
         pytest.approx((-force - 3 * 0.2) / (2 + 0.006), rel=EXACT),
@@ -124,17 +124,17 @@ CONTACTS: dict[str, tuple[str, Callable[[float, float], float]]] = {
 def test_a_contact_pushes_by_its_law_and_never_pulls(name: str, side: str) -> None:
     """Over depth = half width ± (x − x_object) and its rate, which are the same on both sides."""
     words, law = CONTACTS[name]
-    system = coupled(f"type: {name}, side: {side}, a: device, b: load, half_width: 20 mm, {words}")
+    model = coupled(f"type: {name}, side: {side}, a: device, b: load, half_width: 20 mm, {words}")
     sign = 1 if side == "left" else -1
     for depth, rate in ((0.004, 0.1), (0.004, -0.1), (0.004, -90.0), (-0.001, 5.0), (0.0, 1.0)):
         x = {"device.x": 0.05 + sign * (depth - 0.02), "load.x": 0.05}
         x |= {"device.v": 0.5 + sign * rate, "load.v": 0.5}
         push = pytest.approx(law(depth, rate), rel=1e-11, abs=1e-11)
         if "clock" in words:
-            assert ticked(system, x) == {"it.push": push}
-            assert pushes(system, {}, [6.0]) == pytest.approx([-6 * sign, 6 * sign], rel=EXACT)
+            assert ticked(model, x) == {"it.push": push}
+            assert pushes(model, {}, [6.0]) == pytest.approx([-6 * sign, 6 * sign], rel=EXACT)
         else:
-            assert [-sign * pushes(system, x)[0], sign * pushes(system, x)[1]] == [push, push]
+            assert [-sign * pushes(model, x)[0], sign * pushes(model, x)[1]] == [push, push]
 
 
 WALL = "type: VirtualWall, flange: device, stiffness: 900 N/m, clock: tick"
@@ -143,40 +143,40 @@ WALL = "type: VirtualWall, flange: device, stiffness: 900 N/m, clock: tick"
 @pytest.mark.parametrize("side", ["left", "right"])
 @pytest.mark.parametrize(("x", "before"), [(0.06, 0.059), (0.06, 0.07), (0.04, 0.041), (0.04, 0.05)])
 def test_a_virtual_wall_pushes_by_depth_and_backward_difference(side: str, x: float, before: float) -> None:
-    system = coupled(f"{WALL}, damping: 20 N*s/m, position: 50 mm, side: {side}", base=ONE_MASS)
+    model = coupled(f"{WALL}, damping: 20 N*s/m, position: 50 mm, side: {side}", base=ONE_MASS)
     sign = 1 if side == "left" else -1
     depth, rate = sign * (x - 0.05), sign * (x - before) / 0.001
     expected = max(0.0, 900 * depth + 20 * rate) if depth > 0 else 0.0
-    found = ticked(system, {"device.x": x, "device.v": 77.0}, [before])
+    found = ticked(model, {"device.x": x, "device.v": 77.0}, [before])
     assert found == {"it.push": pytest.approx(expected, rel=1e-11), "it.x": x}
-    assert pushes(system, {}, [6.0]) == pytest.approx([-sign * 6], rel=EXACT)
+    assert pushes(model, {}, [6.0]) == pytest.approx([-sign * 6], rel=EXACT)
 
 
 def test_enclosure_walls_push_inwards_from_both_ends() -> None:
     words = "low: -30 mm, high: 30 mm, stiffness: 900 N/m, damping: 2 N*s/m, clock: tick"
-    system = coupled(f"type: EnclosureWalls, flange: device, {words}", base=ONE_MASS)
+    model = coupled(f"type: EnclosureWalls, flange: device, {words}", base=ONE_MASS)
     for x in (-0.05, -0.03, -0.02, 0.0, 0.029, 0.035):
-        found = ticked(system, {"device.x": x}, [x - 0.0001 * math.copysign(1, x)] * 2)
+        found = ticked(model, {"device.x": x}, [x - 0.0001 * math.copysign(1, x)] * 2)
         left, right = ((900 * depth + 2 * 0.1) * (depth > 0) for depth in (-0.03 - x, x - 0.03))
         assert found["it.left.push"] == pytest.approx(left, rel=1e-11)
         assert found["it.right.push"] == pytest.approx(right, rel=1e-11)
-        acting = [found[hold.name] for hold in system.peer_types[0].holds]
-        assert pushes(system, {}, acting) == pytest.approx([left - right], rel=1e-11)
+        acting = [found[hold.name] for hold in model.peer_types[0].holds]
+        assert pushes(model, {}, acting) == pytest.approx([left - right], rel=1e-11)
 
 
 @pytest.mark.parametrize("x", [0.0, 0.00213, -0.00213, 0.0999])
 def test_encoder_quantization_rounds_down_to_whole_steps_and_passes_forces(x: float) -> None:
     wall = WALL.replace("device", "encoder.measured")
-    system = compiled(
+    model = compiled(
         f"{ONE_MASS}{CLOCK}couplers:\n"
         "  encoder: {type: EncoderQuantization, flange: device, resolution: 0.5 mm}\n"
         f"  wall: {{{wall}, position: -1 m}}\n"
     )
     observed = math.floor(x / 0.0005) * 0.0005
-    found = ticked(system, {"device.x": x}, [observed])
+    found = ticked(model, {"device.x": x}, [observed])
     assert found == pytest.approx({"wall.x": observed, "wall.push": 900 * (observed + 1)}, rel=EXACT)
-    assert pushes(system, {}, [6.0]) == pytest.approx([-6], rel=EXACT)
-    assert apc.analyze(system).linearized
+    assert pushes(model, {}, [6.0]) == pytest.approx([-6], rel=EXACT)
+    assert apc.analyze(model).linearized
 
 
 # ---- hands ----
@@ -184,10 +184,10 @@ def test_encoder_quantization_rounds_down_to_whole_steps_and_passes_forces(x: fl
 
 def test_a_spring_damper_arm_holds_its_point() -> None:
     words = "stiffness: 70 N/m, damping: 4 N*s/m, position: 20 mm"
-    system = held(f"type: SpringDamperArm, flange: device, {words}")
-    found = pushes(system, {"device.x": 0.05, "device.v": 0.3})
+    model = held(f"type: SpringDamperArm, flange: device, {words}")
+    found = pushes(model, {"device.x": 0.05, "device.v": 0.3})
     assert found == pytest.approx([-70 * (0.05 - 0.02) - 4 * 0.3], rel=EXACT)
-    assert apc.analyze(system).spectral_radius == pytest.approx(math.exp(-7 / 4), rel=1e-12)
+    assert apc.analyze(model).spectral_radius == pytest.approx(math.exp(-7 / 4), rel=1e-12)
 
 
 # Least, nominal and largest mass in kg, damping in N·s/m and stiffness in N/m of Fu and Cavusoglu's tables II
@@ -205,32 +205,32 @@ def swings(mass: float, damping: float, stiffness: float) -> list[complex]:
     return sorted(found, key=lambda z: (z.imag, z.real))
 
 
-def in_a_second(system: apc.Model) -> list[complex]:
+def in_a_second(model: apc.Model) -> list[complex]:
     """Return the eigenvalues of a frame of a second, which is what a topology without clocks has."""
-    return sorted((mode.eigenvalue for mode in apc.analyze(system).modes), key=lambda z: (z.imag, z.real))
+    return sorted((mode.eigenvalue for mode in apc.analyze(model).modes), key=lambda z: (z.imag, z.real))
 
 
 @pytest.mark.parametrize("stiffness", [70.0, 3.0])  # swings, creeps
 def test_a_mass_spring_damper_arm_moves_with_a_device_as_one_mass(stiffness: float) -> None:
     words = f"mass: 500 g, damping: 4 N*s/m, stiffness: {stiffness} N/m, position: 20 mm"
-    system = held(f"type: MassSpringDamperArm, flange: device, {words}")
-    assert in_a_second(system) == pytest.approx(swings(2 + 0.5, 3 + 4, stiffness), rel=1e-12)
-    assert rates(system, {"device.x": 0.02}) == {"device.x": 0, "device.v": 0}
+    model = held(f"type: MassSpringDamperArm, flange: device, {words}")
+    assert in_a_second(model) == pytest.approx(swings(2 + 0.5, 3 + 4, stiffness), rel=1e-12)
+    assert rates(model, {"device.x": 0.02}) == {"device.x": 0, "device.v": 0}
 
 
 @pytest.mark.parametrize("name", STYLUS_ARMS)
 def test_stylus_arms_have_the_published_values_and_keep_to_their_limits(name: str) -> None:
     part = f"type: {name}, flange: device"
-    system = held(part)
+    model = held(part)
     units = {"mass": "kg", "damping": "N*s/m", "stiffness": "N/m"}
     for (word, unit), (low, nominal, high) in zip(units.items(), STYLUS_ARMS[name], strict=True):
-        assert values(system)[f"it.{word}"] == nominal
+        assert values(model)[f"it.{word}"] == nominal
         for limit, beyond in ((low, 0.999 * low), (high, 1.001 * high)):
             assert values(held(f"{part}, {word}: {limit} {unit}"))[f"it.{word}"] == limit
             (line,) = messages_of(held, f"{part}, {word}: {beyond} {unit}")
             assert f" E207 {word}: expected {limit:g} {unit} or " in line
     (_, m, _), (_, b, _), (_, k, _) = STYLUS_ARMS[name]
-    assert in_a_second(system) == pytest.approx(swings(2 + m, 3 + b, k), rel=1e-12)
+    assert in_a_second(model) == pytest.approx(swings(2 + m, 3 + b, k), rel=1e-12)
 
 
 # ---- devices ----
@@ -253,11 +253,11 @@ DEVICES = {
 
 @pytest.mark.parametrize("name", DEVICES)
 def test_devices_have_the_published_limits_and_move_as_a_mass(name: str) -> None:
-    system = compiled(replaced(ONE_MASS, ("{mass", f"{{type: {name}, mass")))
-    known = values(system)
+    model = compiled(replaced(ONE_MASS, ("{mass", f"{{type: {name}, mass")))
+    known = values(model)
     limits = [known[f"device.{one}_limit"] for one in ("force", "stiffness", "damping", "position")]
     assert tuple(limits) == DEVICES[name]
-    assert pushes(system, {"device.v": 0.3}) == pytest.approx([0], abs=1e-15)
+    assert pushes(model, {"device.v": 0.3}) == pytest.approx([0], abs=1e-15)
     if name == "Falcon":
         assert known["device.resolution"] == pytest.approx(0.0254 / 400, rel=1e-15)  # 400 steps an inch
 

@@ -40,14 +40,14 @@ couplers: {wall: {type: Filtered, a: device, stiffness: 500 N/m, corner: 100 rad
 """
 
 
-def _set(system: apc.Model, clock: str, period: str) -> apc.Model:
-    return apc.set_parameters(system, {f"{clock}.period": period})
+def _set(model: apc.Model, clock: str, period: str) -> apc.Model:
+    return apc.set_parameters(model, {f"{clock}.period": period})
 
 
-def _motion(system: apc.Model) -> tuple[float, list[list[float]]]:
+def _motion(model: apc.Model) -> tuple[float, list[list[float]]]:
     """Return the spectral radius of a topology, and the rows of its first moments."""
-    run = apc.simulate(system, duration="60 ms", jit=False)
-    return apc.analyze(system).spectral_radius, run.values.tolist()
+    run = apc.simulate(model, duration="60 ms", jit=False)
+    return apc.analyze(model).spectral_radius, run.values.tolist()
 
 
 @pytest.mark.few(2)
@@ -63,16 +63,16 @@ def test_a_period_that_is_set_reaches_what_computes_with_it(name: str) -> None:
 
 def test_a_filter_of_ones_own_has_the_period_of_the_clock_each_group_names(tmp_path: Path) -> None:
     own = library(tmp_path, FILTER)
-    system = compiled(FILTERED, own)
+    model = compiled(FILTERED, own)
     for clock, period, change in (
         ("haptic", "2 ms", ("haptic: 1 ms", "haptic: 2 ms")),
         ("slow", "4 ms", ("slow: 5 ms", "slow: 4 ms")),
     ):
-        changed, written = _set(system, clock, period), compiled(replaced(FILTERED, change), own)
+        changed, written = _set(model, clock, period), compiled(replaced(FILTERED, change), own)
         assert _motion(changed) == _motion(written)
         stiffest = [apc.critical(one, "wall.stiffness").value for one in (changed, written)]
         assert stiffest[0] == stiffest[1]
-    assert {one.name: one.exact for one in system.parameters if one.name.endswith(".period")} == {
+    assert {one.name: one.exact for one in model.parameters if one.name.endswith(".period")} == {
         "haptic.period": Fraction(1, 1000),
         "slow.period": Fraction(1, 200),
     }

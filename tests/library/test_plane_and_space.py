@@ -33,9 +33,9 @@ def state(place: np.ndarray, speed: np.ndarray) -> dict[str, float]:
     return found | {f"device.v[{k + 1}]": float(one) for k, one in enumerate(speed)}
 
 
-def pushed(system: apc.Model, *held: float) -> list[float]:
+def pushed(model: apc.Model, *held: float) -> list[float]:
     """Return the force on the mass of 2 kg at rest, when these are held."""
-    return [2 * value for name, value in rates(system, {}, held).items() if name.startswith("device.v")]
+    return [2 * value for name, value in rates(model, {}, held).items() if name.startswith("device.v")]
 
 
 # ---- what a plane has twice ----
@@ -73,7 +73,7 @@ def radial(size: int) -> str:
 @pytest.mark.parametrize("size", [2, 3])
 def test_disc_contact_and_sphere_contact_push_along_the_line_of_centres_and_never_pull(size: int) -> None:
     """f = −(K depth − B rate of distance) d/|d| into the device's side, where that is a push."""
-    system = compiled(radial(size))
+    model = compiled(radial(size))
     inside = np.array([0.012, -0.016, 0.015][:size])
     moving = np.array([-0.3, 0.1, 0.2][:size])
     for place, speed in (
@@ -86,9 +86,9 @@ def test_disc_contact_and_sphere_contact_push_along_the_line_of_centres_and_neve
         away = place / np.linalg.norm(place)
         depth = 0.05 - np.linalg.norm(place)
         push = max(0.0, 900 * depth - 2 * float(away @ speed)) if depth > 0 else 0.0
-        found = ticked(system, at)
+        found = ticked(model, at)
         assert [found[f"ball.f[{k + 1}]"] for k in range(size)] == pytest.approx(-push * away, rel=EXACT)
-    assert pushed(system, *inside) == pytest.approx(-inside, rel=EXACT)
+    assert pushed(model, *inside) == pytest.approx(-inside, rel=EXACT)
 
 
 def test_coinciding_centres_have_no_direction_and_no_verdict() -> None:
@@ -102,7 +102,7 @@ def test_line_contact_and_plane_contact_push_along_their_normal_and_never_pull(s
     name, base = ("LineContact", PLANE) if size == 2 else ("PlaneContact", SPACE)
     normal, point = np.array([3.0, -4.0, 12.0][:size]), np.array([0.1, 0.2, -0.1][:size])
     shown = f"normal: {normal.tolist()}, point: [{', '.join(f'{v} m' for v in point)}]"
-    system = compiled(
+    model = compiled(
         f"{base}couplers:\n  wall: {{type: {name}, flange: device, {shown}, stiffness: 900 N/m, "
         "damping: 2 N*s/m, clock: tick}\n"
     )
@@ -113,8 +113,8 @@ def test_line_contact_and_plane_contact_push_along_their_normal_and_never_pull(s
         place, moving = point + away * unit + along * across, speed * unit
         at = state(place, moving)
         push = max(0.0, 900 * -away - 2 * speed) if away < 0 else 0.0
-        assert ticked(system, at)["wall.push"] == pytest.approx(push, rel=1e-11)
-    assert pushed(system, 5.0) == pytest.approx(5 * unit, rel=EXACT)
+        assert ticked(model, at)["wall.push"] == pytest.approx(push, rel=1e-11)
+    assert pushed(model, 5.0) == pytest.approx(5 * unit, rel=EXACT)
 
 
 # ---- numbers of vectors ----
@@ -123,15 +123,15 @@ def test_line_contact_and_plane_contact_push_along_their_normal_and_never_pull(s
 def starts(text: str, folder: Path | None = None) -> list[list[float]]:
     """Return where the device of each peer starts."""
     if folder is None:
-        system = compiled(text)
+        model = compiled(text)
     else:
         (folder / "topology.yaml").write_text(text, encoding="utf-8")
-        system = apc.compile(folder / "topology.yaml")
-    run = apc.simulate(system, duration="1 ms", jit=False)
+        model = apc.compile(folder / "topology.yaml")
+    run = apc.simulate(model, duration="1 ms", jit=False)
     names = [one.name for one in run.signals]
     return [
         [run.values[0, names.index(f"{g.name}[{peer + 1}].device.x[{k}]")] for k in (1, 2)]
-        for g in system.groups
+        for g in model.groups
         for peer in range(g.count)
     ]
 

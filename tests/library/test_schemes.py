@@ -45,8 +45,8 @@ def pulling(pull: Pull, damping: float = 0.0) -> Law:
     return law
 
 
-def same(system: apc.Model, scheme: ByHand, method: Any = "auto") -> None:
-    found = apc.analyze(system, method=method)
+def same(model: apc.Model, scheme: ByHand, method: Any = "auto") -> None:
+    found = apc.analyze(model, method=method)
     rigid, radius = magnitudes(scheme)
     assert found.rigid_modes == rigid
     assert found.spectral_radius == pytest.approx(radius, abs=SAME + found.spectral_radius_error)

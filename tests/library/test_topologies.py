@@ -46,10 +46,10 @@ def path_of(name: str) -> Path:
 @pytest.mark.few(15)
 @pytest.mark.parametrize("name", NAMES)
 def test_every_topology_compiles_needs_all_it_names_and_has_its_verdict(name: str) -> None:
-    system = apc.compile(path_of(name))
-    assert system.description
-    assert system.name == (name if name != "template" else "my-topology")
-    assert system.dropped == ()
+    model = apc.compile(path_of(name))
+    assert model.description
+    assert model.name == (name if name != "template" else "my-topology")
+    assert model.dropped == ()
     if name in VERDICTS:
-        result = apc.analyze(system)
+        result = apc.analyze(model)
         assert (result.verdict, result.rigid_modes) == VERDICTS[name]

@@ -102,8 +102,8 @@ def by_hand(law: Law, late: int) -> ByHand:
     return ByHand([[(0.2, 5.0, 0.0)]] * 3, everybody(3), forces, first_sent=0, ratio=4, late=late)
 
 
-def same(system: Model, hand: ByHand, method: str = "auto") -> None:
-    found = apc.analyze(system, method=method)  # type: ignore[arg-type] # one of its methods
+def same(model: Model, hand: ByHand, method: str = "auto") -> None:
+    found = apc.analyze(model, method=method)  # type: ignore[arg-type] # one of its methods
     rigid, radius = magnitudes(hand)
     assert found.rigid_modes == rigid
     assert found.spectral_radius == pytest.approx(radius, abs=SAME + found.spectral_radius_error)
@@ -118,8 +118,8 @@ def test_a_coefficient_of_age_is_its_law_in_every_tick(force: str, late: int, tm
     same(topology(force, f"{late} ms", tmp_path), by_hand(LAWS[force], late))
 
 
-def positions(system: Model, *, jit: bool = False) -> Any:
-    run = apc.simulate(system, duration="200 ms", signals=["*.cube.x"], jit=jit)
+def positions(model: Model, *, jit: bool = False) -> Any:
+    run = apc.simulate(model, duration="200 ms", signals=["*.cube.x"], jit=jit)
     return np.array([run[one.name] for one in run.signals]).T
 
 
@@ -163,20 +163,20 @@ def test_what_was_heard_before_is_its_law(force: str, late: int, tmp_path: Path)
         return [-300 * pull], others, []
 
     hand = ByHand([[(0.2, 5.0, 0.0)]] * 3, everybody(3), law, first_sent=0, memory=2, ratio=4, late=late)
-    system = topology(force, f"{late} ms", tmp_path)
-    same(system, hand)
+    model = topology(force, f"{late} ms", tmp_path)
+    same(model, hand)
     starts = [0.001, -0.001, -0.001]
     memories = [[starts[j] for j in others] for others in everybody(3)]
-    found = positions(system)
+    found = positions(model)
     expected = played(hand, [[(x, 0.0)] for x in starts], memories, len(found))
     assert found == pytest.approx(expected, abs=SAME)
     if late == 10:
-        assert positions(system, jit=True) == pytest.approx(found, abs=1e-15)
+        assert positions(model, jit=True) == pytest.approx(found, abs=1e-15)
 
 
-def forces(system: Model, *, jit: bool) -> list[Any]:
+def forces(model: Model, *, jit: bool) -> list[Any]:
     """Return what each peer computed at each tick but the last, over k."""
-    run = apc.simulate(system, duration="300 ms", signals=["*.it.f"], jit=jit)
+    run = apc.simulate(model, duration="300 ms", signals=["*.it.f"], jit=jit)
     assert len(run.signals) == 3
     return [run[one.name][1:] / 1e-15 for one in run.signals]  # a row holds that of the tick before
 
@@ -193,8 +193,8 @@ def test_a_constant_velocity_is_predicted_whatever_the_network_does(
     )
     text = text.replace("cube.x: 1 mm", "cube.v: 0.3 m/s").replace("cube.x: -1 mm", "cube.v: -0.2 m/s")
     part = PART.replace("FORCE", "k*(y - mean(others.x + age(others.x)*others.v))")
-    system = compiled(text, library(tmp_path, part.replace("default: 300", "default: 1e-15")))
-    found = forces(system, jit=jit)
+    model = compiled(text, library(tmp_path, part.replace("default: 300", "default: 1e-15")))
+    found = forces(model, jit=jit)
     for one, own, others in zip(found, (0.3, -0.2, -0.2), (-0.2, 0.05, 0.05), strict=True):
         assert one.tolist() == pytest.approx([(own - others) * tick * 1e-3 for tick in range(300)], abs=1e-9)
 
@@ -212,15 +212,15 @@ experiment: {duration: 50 ms}
 
 def test_ages_that_differ_from_sender_to_sender_are_played_and_not_analysed(tmp_path: Path) -> None:
     text = TOPOLOGY.replace("delay: DELAY", "delay: 3 ms, delays: {left: {right: 7 ms}}")
-    system = topology("k*(y - mean(others.x + age(others.x)*others.v))", "", tmp_path, text)
+    model = topology("k*(y - mean(others.x + age(others.x)*others.v))", "", tmp_path, text)
     with pytest.raises(ApcError) as refused:
-        apc.analyze(system)
+        apc.analyze(model)
     assert str(refused.value).splitlines()[0] == (
         "topology.yaml: E811 the age of samples received by left and right over lan differs "
         "between senders (lan.delay, lan.delays.left.right); different ages can be simulated but not "
         "analyzed. Try: apc simulate"
     )
-    assert np.isfinite(positions(system)).all()
+    assert np.isfinite(positions(model)).all()
 
 
 def test_a_file_whose_ages_differ_compiles_and_is_simulated(

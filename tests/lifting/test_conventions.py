@@ -107,12 +107,12 @@ def test_the_start_cannot_matter_where_all_is_linear_and_one_line_says_so() -> N
 
 def test_where_the_slope_depends_on_what_is_heard_both_readings_of_the_start_are_analysed() -> None:
     """Between copies 10 mm apart a cubic coupling is stiffer than between a copy and nothing heard at 0."""
-    system = edged("sum", [0.0, 0.01, 0.01], cubic=1e7)
-    found = event_order(numeric_model(system))
+    model = edged("sum", [0.0, 0.01, 0.01], cubic=1e7)
+    found = event_order(numeric_model(model))
     assert found.start_matters
     readings = {one.start: one.spectral_radius for one in found.outcomes if ORDER in one.orders}
     assert set(readings) == {"the sender's initial values", "nothing"}
-    assert readings["the sender's initial values"] == analyze(numeric_model(system)).spectral_radius
+    assert readings["the sender's initial values"] == analyze(numeric_model(model)).spectral_radius
     apart = edged("sum", [0.0, 0.0, 0.0], cubic=1e7)
     assert readings["nothing"] != readings["the sender's initial values"]
     # Everybody at 0 hears 0, as if nothing.
@@ -124,8 +124,8 @@ def test_where_the_slope_depends_on_what_is_heard_both_readings_of_the_start_are
 
 def test_a_reading_that_cannot_be_analysed_says_why() -> None:
     """The largest of all that is heard has no slope where nothing is heard yet: all are equal, zero."""
-    system = edged("max", [0.0, 0.01, 0.02])
-    found = event_order(numeric_model(system))
+    model = edged("max", [0.0, 0.01, 0.02])
+    found = event_order(numeric_model(model))
     silent = next(one for one in found.outcomes if one.start == "nothing")
     assert (silent.verdict, silent.stable) == (None, None)
     assert "max over peers with equal values has no linearization" in silent.refusal
@@ -138,16 +138,16 @@ ZERO_DELAYS = [paper(comp=comp, comm=comm) for comp in (NONE, MS) for comm in (N
 
 
 @pytest.mark.parametrize(
-    "system", [*ZERO_DELAYS, *(load_or_compile(TOPOLOGIES / f"{name}.yaml") for name in NAMES)]
+    "model", [*ZERO_DELAYS, *(load_or_compile(TOPOLOGIES / f"{name}.yaml") for name in NAMES)]
 )
 def test_orders_are_grouped_as_if_every_order_were_built(
-    system: Model, monkeypatch: pytest.MonkeyPatch
+    model: Model, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    numeric, pairs = numeric_model(system), tuple(DEPARTURES)
+    numeric, pairs = numeric_model(model), tuple(DEPARTURES)
     built, frames = [], defaultdict[Hashable, list[tuple[str, ...]]](list)
     patterns = [subsystem.pattern for subsystem in numeric.jacobians]
     for order in itertools.permutations(ORDER):
-        schedules = build_schedules(system, numeric.timings, patterns, order=order)
+        schedules = build_schedules(model, numeric.timings, patterns, order=order)
         effects = map(_frame_effect, schedules, [subsystem.pattern for subsystem in numeric.subsystems])
         frames[tuple(effects)].append(order)
 

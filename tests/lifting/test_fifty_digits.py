@@ -33,13 +33,13 @@ def _radius(topology: TopologySource, rigid: int) -> flint.arb:
 @pytest.mark.few(1)
 @pytest.mark.parametrize("name", ["ring-of-eight", "star-lecture", "mixed-clocks", "experiment-mesh"][::-1])
 def test_what_bench_compares_with_is_the_truth_of_the_independent_engine(name: str) -> None:
-    system = compile_topology(TOPOLOGIES / f"{name}.yaml")
-    found = of_balls(system)
-    assert found.digits[:45] == _truth(system).digits[:45]
+    model = compile_topology(TOPOLOGIES / f"{name}.yaml")
+    found = of_balls(model)
+    assert found.digits[:45] == _truth(model).digits[:45]
 
 
-def _truth(system: Model) -> Truth:
-    found = spectral_truth(system)
+def _truth(model: Model) -> Truth:
+    found = spectral_truth(model)
     assert isinstance(found, Truth), found
     return found
 

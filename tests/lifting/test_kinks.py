@@ -124,8 +124,8 @@ def test_a_choice_of_constants_is_a_number(constant: str, value: float, tmp_path
 
 
 def test_a_critical_value_is_that_of_the_worse_side(tmp_path: Path) -> None:
-    system = model(tmp_path, f"max(0, K*{X})", ", K: 100 N/m")
-    found = apc.critical(system, "own.K")
+    compiled_model = model(tmp_path, f"max(0, K*{X})", ", K: 100 N/m")
+    found = apc.critical(compiled_model, "own.K")
     assert found.value is not None
     assert found.value == pytest.approx(40133.778369378, abs=1e-6)
     assert radius(found.value * (1 - 1e-9)) < 1 < radius(found.value * (1 + 1e-9))
@@ -146,11 +146,11 @@ def test_sides_of_equal_slopes_part_where_a_gain_varies(gain: str, tmp_path: Pat
     text = component(f"f = K*max(gain*{X}, other*{X})", "flange.f = hold(f)", variables="f=N")
     numbers = "parameters:\n  gain: {unit: 1, default: 1}\n  other: {unit: 1, default: 1}\n"
     text = text.replace("parameters:\n", numbers)
-    system = compiled(topology(", K: 10 kN/m"), library(tmp_path, text))
-    assert not apc.analyze(system).sides
-    found = apc.critical(system, f"own.{gain}")
+    model = compiled(topology(", K: 10 kN/m"), library(tmp_path, text))
+    assert not apc.analyze(model).sides
+    found = apc.critical(model, f"own.{gain}")
     assert found.value == pytest.approx(4.0133778369378, rel=1e-9)
-    many = apc.analyze_many(system, {f"own.{gain}": [1.0, 2.0, 5.0]})
+    many = apc.analyze_many(model, {f"own.{gain}": [1.0, 2.0, 5.0]})
     assert many.spectral_radius == pytest.approx([radius(10e3), radius(20e3), radius(50e3)], abs=1e-12)
 
 
@@ -189,13 +189,13 @@ def test_many_kinks_are_combined_or_refused_by_name(tmp_path: Path) -> None:
     shelf = library(tmp_path, text)
     for count in (2, 4, 5):
         peers = ", ".join(f"u{k}: {{count: 1, set: {{own.K: {k}0000 N/m}}}}" for k in range(1, count + 1))
-        system = compiled(topology().replace("user: {count: 1}", peers), shelf)
+        model = compiled(topology().replace("user: {count: 1}", peers), shelf)
         if count == 5:
-            (line,) = messages_of(apc.analyze, system)
+            (line,) = messages_of(apc.analyze, model)
             assert "E808" in line
             assert "own.f" in line
             continue
-        found = apc.analyze(system)
+        found = apc.analyze(model)
         truths = [
             max(radius(k * 1e4 * on) for k, on in enumerate(chosen, 1))
             for chosen in itertools.product((0, 1), repeat=count)
@@ -301,13 +301,13 @@ def test_sides_that_no_motion_reaches_are_left_out(tmp_path: Path) -> None:
         (f"max(0, K*{X}) + max(0, -2*K*{X})", 2),
         (f"max(0, K*{X}) + max(0, K*T*sample(der(flange.x)))", 4),
     ):
-        system = model(tmp_path, force)
-        assert len(sides(numeric_model(system))) == count
+        compiled_model = model(tmp_path, force)
+        assert len(sides(numeric_model(compiled_model))) == count
 
 
 def test_where_a_path_crosses_the_kink_no_mean_slope_is_used(tmp_path: Path) -> None:
-    system = model(tmp_path, f"max(0, K*{X})", x="1 mm")
-    many = apc.analyze_many(system, {"device.x": [-1e-3, 0.0, 1e-3]})
+    compiled_model = model(tmp_path, f"max(0, K*{X})", x="1 mm")
+    many = apc.analyze_many(compiled_model, {"device.x": [-1e-3, 0.0, 1e-3]})
     assert many.spectral_radius[0] == pytest.approx(radius(0), abs=1e-12)
     assert many.spectral_radius[2] == pytest.approx(radius(60e3), abs=1e-12)
     assert math.isnan(many.spectral_radius[1]) or many.spectral_radius[1] == pytest.approx(
@@ -410,9 +410,9 @@ def test_a_critical_delay_is_that_of_the_worse_side() -> None:
 @pytest.mark.whole
 def test_an_unstable_side_decides_a_long_frame_without_proofs(monkeypatch: pytest.MonkeyPatch) -> None:
     """Over 382 ticks floats leave three of four sides undecided; the fourth is unstable, also in balls."""
-    system = apc.compile(str(TOPOLOGIES / "two-users-passivity.yaml"))
+    model = apc.compile(str(TOPOLOGIES / "two-users-passivity.yaml"))
     period, value = ParameterRef("haptic.period"), Fraction(1, 9425)
-    changed = system_with_delay(system, period, value)
+    changed = system_with_delay(model, period, value)
     *_, inactive = sides(numeric_model(changed))
     truth = analyze(inactive.numeric, certify=True)
     assert truth.stable is False and truth.proof.bits > 0
@@ -423,7 +423,7 @@ def test_an_unstable_side_decides_a_long_frame_without_proofs(monkeypatch: pytes
     assert found.stable is False and abs(found.spectral_radius - truth.spectral_radius) <= (
         found.spectral_radius_error + truth.spectral_radius_error
     )
-    path = NominalPeriodPath(period, system, None, None, LOCATION, numeric_model(system))
+    path = NominalPeriodPath(period, model, None, None, LOCATION, numeric_model(model))
     assert path.verdict_at(value).stable is False
     # Floats leave this side undecided, too, and its proof in a search would take seconds.
     assert path.verdict_at(Fraction(133, 33375)).stable is None

@@ -34,17 +34,17 @@ def _cubic_pairs(starts: list[float], cubic: float) -> dict[tuple[int, int], flo
 @pytest.mark.parametrize("starts", [[0.0, 0.0, 0.0, 0.0], [0.01, 0.02, 0.05, 0.02]])
 def test_an_edge_function_is_linearized_pair_by_pair(operator: str, graph: str, starts: list[float]) -> None:
     arcs = None if graph == "complete" else {(i, j): weight for i, j, weight in arcs_of(graph, 4)}
-    system = edged(operator, starts, cubic=2e5, weights=arcs, **GAINS)
+    model = edged(operator, starts, cubic=2e5, weights=arcs, **GAINS)
     topology = TopologySource(operator, 4, weights=arcs, pairs=_cubic_pairs(starts, 2e5), **GAINS)
     expected = np.linalg.eigvals(np.array(frame_matrix(topology)))
-    assert apart(_split(system), expected) < 1e-11
-    whole = np.linalg.eigvals(dense(*lifted_classes(numeric_model(system))).matrix)
+    assert apart(_split(model), expected) < 1e-11
+    whole = np.linalg.eigvals(dense(*lifted_classes(numeric_model(model))).matrix)
     assert apart(whole, expected) < 1e-11
 
 
-def _split(system: Model) -> np.ndarray:
+def _split(model: Model) -> np.ndarray:
     """Return all eigenvalues of the split system, each as often as it counts."""
-    systems = split(*lifted_classes(numeric_model(system)))
+    systems = split(*lifted_classes(numeric_model(model)))
     return np.concatenate([np.repeat(np.linalg.eigvals(one.matrix), one.multiplicity) for one in systems])
 
 

@@ -23,41 +23,41 @@ from apc.studies.margins import margins
 from tests.topologies import AVERAGE, MESH, TOPOLOGIES, compiled, library, replaced
 
 
-def _value(system: Model, name: str, group: int = 0) -> float:
-    return float(resolve(system).parameters[group][0, system.peer_types[0].parameters.index(name)])
+def _value(model: Model, name: str, group: int = 0) -> float:
+    return float(resolve(model).parameters[group][0, model.peer_types[0].parameters.index(name)])
 
 
-def _column(system: Model, name: str) -> list[float]:
+def _column(model: Model, name: str) -> list[float]:
     """Return a parameter's value of each peer of the first group."""
-    numbers = resolve(system)
+    numbers = resolve(model)
     return [
         float(value)
-        for value in numbers.parameters[0][numbers.rows[0], system.peer_types[0].parameters.index(name)]
+        for value in numbers.parameters[0][numbers.rows[0], model.peer_types[0].parameters.index(name)]
     ]
 
 
 @pytest.mark.parametrize("name", ["contact.stiffness", "couplers.contact.stiffness"])
 def test_an_override_reaches_every_group_or_the_one_named(name: str) -> None:
-    system = compiled(
+    model = compiled(
         replaced(
             AVERAGE,
             ("user: {count: 3}", "left: {count: 1, set: {contact.stiffness: 7 N/m}}\n  right: {count: 1}"),
         )
     )
-    override = parse_override(system, f"{name}=0.8 N/mm")
+    override = parse_override(model, f"{name}=0.8 N/mm")
     assert override == Override(ParameterRef("contact.stiffness"), Fraction(800))
-    changed = apply(system, [override])
+    changed = apply(model, [override])
     assert [_value(changed, "contact.stiffness", group) for group in (0, 1)] == [800.0, 800.0]
-    changed = apply(system, [parse_override(system, "left.contact.stiffness=0.8 N/mm")])
-    assert _value(changed, "contact.stiffness", 1) == _value(system, "contact.stiffness", 1) != 800.0
+    changed = apply(model, [parse_override(model, "left.contact.stiffness=0.8 N/mm")])
+    assert _value(changed, "contact.stiffness", 1) == _value(model, "contact.stiffness", 1) != 800.0
 
 
 @pytest.mark.parametrize("name", ["device.mass", "user.device.mass"])
 def test_an_override_replaces_a_column(name: str) -> None:
-    system = compiled(replaced(AVERAGE, ("{count: 3}", "{set: {device.mass: [0.1 kg, 0.2 kg, 0.1 kg]}}")))
-    changed = apply(system, [parse_override(system, f"{name}=0.5 kg")])
+    model = compiled(replaced(AVERAGE, ("{count: 3}", "{set: {device.mass: [0.1 kg, 0.2 kg, 0.1 kg]}}")))
+    changed = apply(model, [parse_override(model, f"{name}=0.5 kg")])
     assert _column(changed, "device.mass") == [0.5, 0.5, 0.5]
-    stored = apply(system, [parse_override(system, "contact.stiffness=5 N/m")])
+    stored = apply(model, [parse_override(model, "contact.stiffness=5 N/m")])
     assert _column(stored, "device.mass") == [0.1, 0.2, 0.1]
 
 
@@ -79,21 +79,21 @@ links: {lan: {clock: network, delay: base*ratio}}
 @pytest.mark.parametrize("setting", ["base=4.8 ms", "ratio=5/3"])
 def test_a_time_that_depends_on_a_third_stays_the_very_tick(setting: str) -> None:
     """4.8 ms · 5/3 is 8 ms: a packet that came 2e-19 s later would miss its tick."""
-    system = compiled(THIRDS)
-    changed = apply(system, [parse_override(system, setting)])
+    model = compiled(THIRDS)
+    changed = apply(model, [parse_override(model, setting)])
     assert resolve(changed).timings["lan.delay"] == Fraction(8, 1000)
 
 
 @pytest.mark.few(4)
 @pytest.mark.parametrize("topology", sorted(path.name for path in TOPOLOGIES.glob("*.yaml")))
 def test_setting_a_number_to_what_it_is_changes_nothing(topology: str) -> None:
-    system = compile_topology(TOPOLOGIES / topology)
-    before = resolve(system)
-    for row in apc.parameters(system).rows:
+    model = compile_topology(TOPOLOGIES / topology)
+    before = resolve(model)
+    for row in apc.parameters(model).rows:
         if row.follows or row.fixed or row.low != row.high or math.isnan(row.low):
             continue
         written = before.timings.get(row.name, Fraction(repr(row.low)))
-        after = resolve(apc.set_parameters(system, {row.name: written}))
+        after = resolve(apc.set_parameters(model, {row.name: written}))
         assert after.timings == before.timings, row
         for one, other in zip(after.parameters, before.parameters, strict=True):
             assert np.array_equal(one, other), row
@@ -133,8 +133,8 @@ couplers: {o: {type: Outer, a: device, b: cube, k: 1 N/m, clock: haptic}}
 def test_what_a_group_sets_of_a_part_reaches_the_parts_inside(
     tmp_path: Path, settings: list[str], stiffness: tuple[int, int], delays: tuple[int, int]
 ) -> None:
-    system = compiled(NESTED, library(tmp_path, OUTER))
-    changed = apply(system, [parse_override(system, text) for text in settings])
+    model = compiled(NESTED, library(tmp_path, OUTER))
+    changed = apply(model, [parse_override(model, text) for text in settings])
     numbers = resolve(changed)
     peer_types = [changed.peer_types[group.peer_type] for group in changed.groups]
     rows = zip(peer_types, numbers.parameters, strict=True)
@@ -152,9 +152,9 @@ def test_what_depends_on_a_column_is_worked_out_peer_by_peer(tmp_path: Path) -> 
         NESTED,
         ("{one: {count: 1}, two: {count: 2, set: {o.k: 7 N/m", "{two: {set: {o.k: [1 N/m, 3 N/m, 7 N/m]"),
     )
-    system = compiled(text, library(tmp_path, part))
-    assert _column(system, "o.inner.stiffness") == pytest.approx([0.5, 12.0, 21.0], rel=1e-15)
-    less = apply(system, [parse_override(system, "o.rest=0.5 N/m")])
+    model = compiled(text, library(tmp_path, part))
+    assert _column(model, "o.inner.stiffness") == pytest.approx([0.5, 12.0, 21.0], rel=1e-15)
+    less = apply(model, [parse_override(model, "o.rest=0.5 N/m")])
     assert _column(less, "o.inner.stiffness") == pytest.approx([3.0, 9.0, 3.5], rel=1e-15)
 
 
@@ -176,14 +176,14 @@ def test_what_the_compiler_counts_or_adds_is_nobody_s_to_set() -> None:
     """A hold without delay, one by an expression, and how many are heard have names that mean nothing."""
     own = compiled(replaced(AVERAGE, ("link: lan}", "link: lan, delays: own}")))
     star = compiled(replaced(MESH, ("delay: 8 ms}", "delay: 8 ms, graph: star}")))
-    for system in (own, star):
-        names = [one.name for one in (*system.parameters, *system.timings)]
+    for model in (own, star):
+        names = [one.name for one in (*model.parameters, *model.timings)]
         unnamed = [name for name in names if not is_named(name)]
         assert unnamed
         for name in unnamed:
             with pytest.raises(ApcError, match="E623" if counts_peers(name) else "E622"):
-                find(system, name)
-        assert all(is_named(row.parameter) for row in margins(numeric_model(system)).rows)
+                find(model, name)
+        assert all(is_named(row.parameter) for row in margins(numeric_model(model)).rows)
     with pytest.raises(ApcError, match=r"E623 user.count is a number of peers and can't be varied here"):
         find(own, "user.count")
     five = apply(own, [parse_override(own, "user.count=5")])

@@ -74,10 +74,10 @@ def _text(changes: dict[str, str]) -> str:
 
 @pytest.mark.parametrize("place", VARYING)
 def test_a_coefficient_that_changes_with_time_is_refused_by_name(place: str, tmp_path: Path) -> None:
-    system = compiled(TOPOLOGY, library(tmp_path, _text(VARYING[place])))
+    model = compiled(TOPOLOGY, library(tmp_path, _text(VARYING[place])))
     for requested in (analyze, lambda topology: critical(topology, "w.k")):
         with pytest.raises(ApcError, match=r"topology\.yaml: E810 the equation of .* function of time"):
-            requested(system)
+            requested(model)
 
 
 @pytest.mark.parametrize("place", CONSTANT)

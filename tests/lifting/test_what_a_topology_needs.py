@@ -47,12 +47,12 @@ KEPT = {
 @pytest.mark.few(10)
 @pytest.mark.parametrize("name", KEPT)
 def test_a_topology_keeps_what_it_needs_and_no_more(name: str) -> None:
-    system = compile_topology(TOPOLOGIES / f"{name}.yaml")
-    found = model_size(system)
+    model = compile_topology(TOPOLOGIES / f"{name}.yaml")
+    found = model_size(model)
     assert [
         (subsystem.motion, subsystem.stored, subsystem.packets) for subsystem in found.subsystems
     ] == KEPT[name]
-    assert system.dropped == ()
+    assert model.dropped == ()
 
 
 CONTACT, COORDINATION, LINK = "haptic, delay: 1 ms}", "haptic, delay: 1 ms, link", "network, delay: 8 ms}"
@@ -76,7 +76,7 @@ CONTACT, COORDINATION, LINK = "haptic, delay: 1 ms}", "haptic, delay: 1 ms, link
 def test_a_peer_keeps_its_motion_its_delayed_forces_and_its_packets_on_their_way(
     changes: tuple[tuple[str, str], ...], counts: tuple[int, int, int]
 ) -> None:
-    system = compiled(replaced(AVERAGE, *changes))
-    (subsystem,) = model_size(system).subsystems
+    model = compiled(replaced(AVERAGE, *changes))
+    (subsystem,) = model_size(model).subsystems
     assert (subsystem.motion, subsystem.stored, subsystem.packets) == counts
-    assert subsystem.states == sum(counts) == analyze(numeric_model(system)).states_per_peer
+    assert subsystem.states == sum(counts) == analyze(numeric_model(model)).states_per_peer

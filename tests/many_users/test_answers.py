@@ -117,12 +117,12 @@ def test_peers_that_weigh_one_another_move_together_freely(seed: int) -> None:
         for receiver in (1, 2, 3)
         if sender != receiver
     ]
-    system = compiled(weighted(f"arcs: [{', '.join(arcs)}]"))
-    found = apc.analyze(system, certify=True)
+    model = compiled(weighted(f"arcs: [{', '.join(arcs)}]"))
+    found = apc.analyze(model, certify=True)
     assert found.verdict == "stable up to a common translation"
     assert str(found.proof).startswith("proved stable")
     with precision(256):
-        assert check(found, *truth(system)) == ""
+        assert check(found, *truth(model)) == ""
 
 
 def test_rows_of_weights_that_add_up_to_one_as_decimals_are_a_mean(tmp_path: Path) -> None:
@@ -138,8 +138,8 @@ equations:
 """
     text = weighted("arcs: [[1, 2, 0.1], [3, 2, 0.9], [2, 1, 0.3], [3, 1, 0.7], [1, 3, 0.4], [2, 3, 0.6]]")
     text = replaced(text, ("type: FullMesh", "type: WeightedMean"), (", delay: 1 ms, link", ", link"))
-    system = compiled(text, library(tmp_path, part))
-    assert apc.analyze(system, certify=True).verdict == "stable up to a common translation"
+    model = compiled(text, library(tmp_path, part))
+    assert apc.analyze(model, certify=True).verdict == "stable up to a common translation"
 
 
 CANCEL = "arcs: [[1, 4, 0.1], [2, 4, 0.2], [3, 4, -0.3], [4, 1], [4, 2], [4, 3]]"

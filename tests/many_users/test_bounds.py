@@ -87,10 +87,10 @@ def test_the_truth_at_120_digits_is_within_the_bound_of_every_mode(values: dict[
 @pytest.mark.parametrize("bt", [0.0, 1.0])
 def test_next_to_the_boundary_every_verdict_is_decided_and_right(bt: float) -> None:
     values = {"bt": bt, "bc": 2.0, "kc": 500.0, "comp": MS, "comm": 8 * MS}
-    system = compiled(text_of(TopologySource(peers=2, kt=1.0, **values)))  # type: ignore[arg-type] # numbers and times
+    model = compiled(text_of(TopologySource(peers=2, kt=1.0, **values)))  # type: ignore[arg-type] # numbers and times
 
     def beyond(kt: float) -> float:
-        return apc.analyze(system, params={"coordination.stiffness": f"{kt!r} N/m"}).spectral_radius - 1
+        return apc.analyze(model, params={"coordination.stiffness": f"{kt!r} N/m"}).spectral_radius - 1
 
     crossing = brentq(beyond, 1.0, 20000.0, xtol=1e-12)
     steps = (-1e-9, -1e-13, 0.0, 1e-13, 1e-9)
@@ -100,10 +100,10 @@ def test_next_to_the_boundary_every_verdict_is_decided_and_right(bt: float) -> N
 
 def test_as_many_digits_are_taken_as_decide() -> None:
     """At the last float below a boundary, 1 − ρ is 1e-16 or less: too near for floats, not for a proof."""
-    system = compiled(text_of(TopologySource()))
+    model = compiled(text_of(TopologySource()))
 
     def at(kt: float) -> Analysis:
-        return apc.analyze(system, params={"coordination.stiffness": f"{kt!r} N/m"})
+        return apc.analyze(model, params={"coordination.stiffness": f"{kt!r} N/m"})
 
     low, high = 1096.0, 1097.0
     while np.nextafter(low, high) < high:

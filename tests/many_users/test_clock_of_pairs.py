@@ -174,8 +174,8 @@ def poles(values: NDArray[np.complex128]) -> NDArray[np.complex128]:
     return values[(np.abs(values) > 1e-6) & (np.abs(values - 1) > 1e-9)]
 
 
-def found_poles(system: Model) -> NDArray[np.complex128]:
-    modes = apc.analyze(system).modes
+def found_poles(model: Model) -> NDArray[np.complex128]:
+    modes = apc.analyze(model).modes
     return poles(np.array([one.eigenvalue for one in modes for _ in range(one.multiplicity)]))
 
 
@@ -216,10 +216,10 @@ SLOWER = {
 @pytest.mark.parametrize("slow", SLOWER)
 @pytest.mark.parametrize("coupler", ["AveragePosition", "FullMesh"])
 def test_the_poles_are_those_of_the_events_by_hand(coupler: str, slow: str) -> None:
-    system = compiled(topology(coupler, 120, slow=slow))
+    model = compiled(topology(coupler, 120, slow=slow))
     hand = ByHand((*[Clock(FAST)] * 3, SLOWER[slow]), 120, coupler == "AveragePosition")
-    frame = hand.frame(Fraction(apc.analyze(system).frame_s).limit_denominator(1000))
-    assert distance(found_poles(system), poles(np.linalg.eigvals(frame))) < 1e-9
+    frame = hand.frame(Fraction(apc.analyze(model).frame_s).limit_denominator(1000))
+    assert distance(found_poles(model), poles(np.linalg.eigvals(frame))) < 1e-9
 
 
 @pytest.mark.parametrize(
@@ -234,8 +234,8 @@ def test_the_poles_are_those_of_the_events_by_hand(coupler: str, slow: str) -> N
 )
 def test_a_simulation_is_the_events_by_hand(coupler: str, loss: str, jit: bool) -> None:
     pairs = f"{loss}pairs: {{mobile: {{user: {{clock: slow}}}}}}"
-    system = compiled(topology(coupler, 120, link=pairs))
-    found = apc.simulate(system, duration="0.4 s", params={"mobile.device.v": 1.0}, jit=jit)
+    model = compiled(topology(coupler, 120, link=pairs))
+    found = apc.simulate(model, duration="0.4 s", params={"mobile.device.v": 1.0}, jit=jit)
     hand = ByHand((*[Clock(FAST)] * 3, Clock(SLOW)), 120, coupler == "AveragePosition")
     start = np.eye(hand.size)[8 * 3 + 1]
     state = np.linalg.matrix_power(hand.frame(Fraction(1, 5)), 2) @ start
@@ -269,8 +269,8 @@ def test_lost_packets_of_the_pairs_are_those_of_a_second_link() -> None:
     assert np.abs(one.values - none.values).max() > 1e-5
 
 
-def growth(system: Model) -> float:
-    found = apc.mean_square_stability(system)
+def growth(model: Model) -> float:
+    found = apc.mean_square_stability(model)
     assert found is not None and found.exact and found.mean_square_radius is not None, found
     return found.mean_square_radius
 
@@ -284,7 +284,7 @@ def test_second_moments_are_those_of_the_events_by_hand(slow: str) -> None:
     """At a stiffness where they grow: the expectation of M ⊗ M is a product over the events of a frame."""
     clock = Clock(16 * MS, 3 * MS) if "16" in slow else Clock(4 * MS, MS)
     pairs = "loss: 20 %, pairs: {mobile: {user: {clock: slow, loss: 40 %}}}"
-    system = compiled(topology("AveragePosition", 2500, users=1, link=pairs, slow=slow))
+    model = compiled(topology("AveragePosition", 2500, users=1, link=pairs, slow=slow))
     hand = ByHand((Clock(FAST), clock), 2500)
     operator = np.eye(hand.size**2)
     for kind, step, arc in hand.events(16 * MS if "16" in slow else 8 * MS):
@@ -295,7 +295,7 @@ def test_second_moments_are_those_of_the_events_by_hand(slow: str) -> None:
         operator = after @ operator
     moments = float(np.abs(np.linalg.eigvals(operator)).max())
     assert moments > 1.01
-    assert growth(system) == pytest.approx(moments, rel=1e-8)
+    assert growth(model) == pytest.approx(moments, rel=1e-8)
 
 
 def saturated(text: str) -> str:
@@ -334,19 +334,19 @@ def test_the_age_of_samples_is_analyzed_if_all_packets_of_a_peer_have_one_clock(
 
 
 def test_the_clock_of_the_link_is_no_other_clock() -> None:
-    system = compiled(topology(link="pairs: {mobile: {user: {clock: fast}}}"))
-    assert system.links[0].clocks == ("fast",) and {clock.name for clock in system.clocks} == {
+    model = compiled(topology(link="pairs: {mobile: {user: {clock: fast}}}"))
+    assert model.links[0].clocks == ("fast",) and {clock.name for clock in model.clocks} == {
         "haptic",
         "fast",
     }
 
 
 def test_a_period_of_pairs_is_varied_as_that_of_a_clock() -> None:
-    system = compiled(topology("FullMesh", 120, **QUICK))
-    found = apc.sweep(system, {"slow.period": ["8 ms", "40 ms"]}, jobs=1).column("spectral_radius")
+    model = compiled(topology("FullMesh", 120, **QUICK))
+    found = apc.sweep(model, {"slow.period": ["8 ms", "40 ms"]}, jobs=1).column("spectral_radius")
     written = topology("FullMesh", 120, slow="{period: 40 ms, phase: 3 ms}")
     assert found[1] == pytest.approx(apc.analyze(compiled(written)).spectral_radius, rel=1e-12)
-    assert "18 values" in str(apc.critical(system, "slow.period"))  # periods with short frames
+    assert "18 values" in str(apc.critical(model, "slow.period"))  # periods with short frames
 
 
 def test_numbers_sent_per_second_are_those_of_both_clocks() -> None:
@@ -356,12 +356,12 @@ def test_numbers_sent_per_second_are_those_of_both_clocks() -> None:
 
 
 def test_what_requires_one_clock_of_a_link_refuses_others_by_name(tmp_path: Path) -> None:
-    system = compiled(topology("FullMesh", 60, **QUICK))
+    model = compiled(topology("FullMesh", 60, **QUICK))
     for suffix, code, peer in (("c", "E960", "user[1]"), ("fmu", "E960", ""), ("mo", "E955", "")):
         with pytest.raises(ApcError, match=rf"{code} .*pairs of groups of lan"):
-            apc.export(system, out=tmp_path / f"out.{suffix}", peer=peer)
+            apc.export(model, out=tmp_path / f"out.{suffix}", peer=peer)
     with pytest.raises(ApcError, match=r"E861 .*one network clock \(got fast and slow\)"):
-        apc.analyze(system, method="paper")
+        apc.analyze(model, method="paper")
 
 
 @pytest.mark.needs_extension("loss_models")
@@ -379,9 +379,9 @@ def test_bursts_at_two_clocks_are_not_judged() -> None:
 @pytest.mark.needs_extension("changing_counts")
 def test_a_change_after_which_no_packets_have_the_clock_is_refused() -> None:
     keys = "pairs: {user: {user: {clock: slow}}}"
-    system = compiled(topology("FullMesh", 60, users=2, link=keys, **QUICK))
+    model = compiled(topology("FullMesh", 60, users=2, link=keys, **QUICK))
     with pytest.raises(ApcError, match=r"E914 packets from 0\.016 s on: expected all delays and clocks"):
-        apc.simulate(system, duration="0.1 s", leaves={"user[1]": "16 ms"}, jit=False)
+        apc.simulate(model, duration="0.1 s", leaves={"user[1]": "16 ms"}, jit=False)
 
 
 @pytest.mark.needs_extension("changing_counts")

@@ -15,8 +15,8 @@ from tests.networks.test_loss import decided
 
 
 def estimate(text: str) -> TopLyapunovExponent:
-    system = system_of(text)
-    return top_lyapunov_exponent(numeric_model(system))
+    model = system_of(text)
+    return top_lyapunov_exponent(numeric_model(model))
 
 
 # Of an independent program, for the paper's users at 10 % loss: peers, stiffness, exponent per frame and half
@@ -62,6 +62,6 @@ def test_what_grows_in_mean_square_is_told_almost_surely_too() -> None:
     ],
 )
 def test_what_is_not_estimated_is_named(text: str, why: str) -> None:
-    system = system_of(text)
+    model = system_of(text)
     with pytest.raises(NotSupportedError, match=f"^{re.escape(why)}"):
-        top_lyapunov_exponent(numeric_model(system))
+        top_lyapunov_exponent(numeric_model(model))

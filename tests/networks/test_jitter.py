@@ -37,9 +37,9 @@ def test_within_a_tick_nobody_hears_the_difference() -> None:
 
 @pytest.mark.needs_extension("parameter_boxes")
 def test_a_jitter_is_no_range_of_a_box_and_another_number_is() -> None:
-    system = system_of(late(3, 500.0, "2 ms"))
+    model = system_of(late(3, 500.0, "2 ms"))
     with pytest.raises(ApcError, match=r"E831 lan\.jitter is a time"):
-        apc.robust_stability(system, {"lan.jitter": "±1%"})
-    assert apc.robust_stability(system, {"contact.stiffness": "±0.01%"}).stable
+        apc.robust_stability(model, {"lan.jitter": "±1%"})
+    assert apc.robust_stability(model, {"contact.stiffness": "±0.01%"}).stable
     with pytest.raises(ApcError, match=r"E625 lan\.jitter: expected a time of 0 s or more"):
-        apc.set_parameters(system, {"lan.jitter": "-1 ms"})
+        apc.set_parameters(model, {"lan.jitter": "-1 ms"})

@@ -101,33 +101,33 @@ def test_where_a_reference_is_critical_the_radius_is_1(
     assert found.error is not None and found.error < 1e-7
 
 
-def by_critical(system: Model, near: float) -> tuple[float, float]:
-    found = apc.critical(system, STIFFNESS, lower="900 N/m", upper="1600 N/m")
+def by_critical(model: Model, near: float) -> tuple[float, float]:
+    found = apc.critical(model, STIFFNESS, lower="900 N/m", upper="1600 N/m")
     assert (found.criterion, found.limitations, found.stable_side) == ("mean-square", (), "below")
     assert found.value is not None and found.error is not None
     return found.value, found.error
 
 
-def by_margins(system: Model, near: float) -> tuple[float, float]:
+def by_margins(model: Model, near: float) -> tuple[float, float]:
     from apc.lifting.numeric_model import numeric_model
     from apc.studies.margins import Margins, network_margins
 
-    found = network_margins(numeric_model(system), Margins((), ""))
+    found = network_margins(numeric_model(model), Margins((), ""))
     row = next(row for row in found.rows if row.parameter == STIFFNESS)
     assert row.value is not None and row.error is not None
     assert row.gain_margin == row.value / 500
     return row.value, row.error
 
 
-def by_sweep(system: Model, near: float) -> tuple[float, float]:
-    found = apc.sweep(system, {STIFFNESS: f"{near - 1e-3!r},{near + 1e-3!r} N/m"}, jobs=1)
+def by_sweep(model: Model, near: float) -> tuple[float, float]:
+    found = apc.sweep(model, {STIFFNESS: f"{near - 1e-3!r},{near + 1e-3!r} N/m"}, jobs=1)
     assert found.column("verdict").tolist() == ["stable in mean square", "unstable in mean square"]
     return near, 1e-3
 
 
-def by_box(system: Model, near: float) -> tuple[float, float]:
+def by_box(model: Model, near: float) -> tuple[float, float]:
     below, above = (
-        apc.robust_stability(system, {STIFFNESS: f"{low!r} N/m:{high!r} N/m"})
+        apc.robust_stability(model, {STIFFNESS: f"{low!r} N/m:{high!r} N/m"})
         for low, high in ((near - 1, near - 0.01), (near - 1, near + 0.01))
     )
     assert (below.verdict, above.verdict) == ("stable in mean square", "unstable in mean square")
@@ -160,8 +160,8 @@ def test_every_way_to_ask_finds_the_stiffness_at_which_a_reference_is_critical(
 
 @pytest.mark.whole
 def test_a_region_over_loss_ends_where_the_references_do() -> None:
-    system = compiled(unreliable("loss: 10 %"))
-    found = apc.region(system, x="lan.loss=0 %:40 %", y=f"{STIFFNESS}=1000 N/m:1500 N/m")
+    model = compiled(unreliable("loss: 10 %"))
+    found = apc.region(model, x="lan.loss=0 %:40 %", y=f"{STIFFNESS}=1000 N/m:1500 N/m")
     (curve,) = found.curves
     ends = dict(sorted(map(tuple, curve.points[[0, -1]].tolist())))
     # The references: 1096.4 N/m without losses, 1384 N/m at 40 %.
@@ -225,26 +225,26 @@ def test_a_proof_is_told_where_it_is_asked_for_and_there_is_one(
     ],
 )
 def test_what_is_not_served_is_not_judged_and_says_why(more: str, why: str) -> None:
-    system = compiled(unreliable(more))
-    found = apc.mean_square_stability(system)
+    model = compiled(unreliable(more))
+    found = apc.mean_square_stability(model)
     assert found is not None
     assert (found.verdict, found.stable, found.mean_square_radius) == ("not judged", None, None)
     assert why in found.notes[0]
     with pytest.raises(ApcError, match="E898 no mean-square verdict") as error:
-        apc.critical(system, STIFFNESS)
+        apc.critical(model, STIFFNESS)
     assert error.value.mistakes[0].fix == "--criterion nominal"
 
 
 def test_what_cannot_be_varied_is_refused_with_what_can() -> None:
-    system = compiled(unreliable("loss: 1 %"))
+    model = compiled(unreliable("loss: 1 %"))
     with pytest.raises(ApcError, match=r"E898 .* every packet of lan is lost") as error:
-        apc.critical(system, "lan.loss", lower="99 %", upper="100 %")
+        apc.critical(model, "lan.loss", lower="99 %", upper="100 %")
     assert error.value.mistakes[0].advice == "narrow the range"
     with pytest.raises(ApcError, match=r"E898 lan\.delay can't be varied in mean square"):
-        apc.critical(system, "lan.delay")
+        apc.critical(model, "lan.delay")
     for name, value in (("lan.loss", "101 %"), ("lan.loss", "-1 %")):
         with pytest.raises(ApcError, match=r"E624 lan\.loss"):
-            apc.set_parameters(system, {name: value})
+            apc.set_parameters(model, {name: value})
 
 
 @pytest.mark.whole

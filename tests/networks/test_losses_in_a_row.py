@@ -164,12 +164,12 @@ def test_what_is_not_served_is_left_open_and_named(text: str, why: str) -> None:
 def test_the_pattern_is_played_and_grows_as_it_says(delay: str, clock: str) -> None:
     apart = "  left: {count: 1, set: {device.x: 1 mm}}\n  right: {count: 1}"
     text = topology(2, 900.0, delay=delay).replace("  user: {count: 2}", apart)
-    system = system_of(text.replace("network: 8 ms", f"network: {clock}"))
-    found = apc.mean_square_stability(system)
+    model = system_of(text.replace("network: 8 ms", f"network: {clock}"))
+    found = apc.mean_square_stability(model)
     assert found is not None and found.losses_in_a_row is not None
     pattern, grown = found.losses_in_a_row.unstable_pattern, found.losses_in_a_row.growth
     assert pattern is not None and grown is not None
-    played = apc.simulate(system, duration="6 s", trace_of="worst", jit=False)
+    played = apc.simulate(model, duration="6 s", trace_of="worst", jit=False)
     moved = played["left[1].cube.x"] - played["right[1].cube.x"]
     # Rows come every millisecond, frames every eight; many periods of the pattern, far from the start.
     many = 360 // len(pattern) * len(pattern)

@@ -20,16 +20,16 @@ from tests.networks.test_loss import STIFFNESS
 from tests.topologies import AVERAGE, compiled, replaced
 
 
-def grown(system: Model) -> Margins:
-    return network_margins(numeric_model(system), Margins((), ""))
+def grown(model: Model) -> Margins:
+    return network_margins(numeric_model(model), Margins((), ""))
 
 
 @pytest.mark.whole
 def test_over_another_network_a_margin_is_another() -> None:
     """Of three users, brute force over all patterns: 1384 N/m at a loss of 40 %, to 0.5 N/m."""
-    system = system_of(topology(3, 500.0, loss="40 %"))
+    model = system_of(topology(3, 500.0, loss="40 %"))
     nominal, found = (
-        {row.parameter: row.value for row in one.rows} for one in (apc.margins(system), grown(system))
+        {row.parameter: row.value for row in one.rows} for one in (apc.margins(model), grown(model))
     )
     assert nominal[STIFFNESS] == pytest.approx(1096.41, abs=0.01)
     assert found[STIFFNESS] == pytest.approx(1384, abs=1)
@@ -45,8 +45,8 @@ def test_a_loss_with_a_name_of_its_own_has_the_margin_of_the_loss() -> None:
 
 
 def test_derivatives_are_those_of_moments_followed_event_by_event() -> None:
-    system = system_of(topology(2, 900.0))
-    found = {row.parameter: row for row in network_sensitivities(numeric_model(system)).rows}
+    model = system_of(topology(2, 900.0))
+    found = {row.parameter: row for row in network_sensitivities(numeric_model(model)).rows}
 
     def radius(stiffness: float = 900.0, loss: float = 0.1) -> float:
         return second_moment_radius(TopologySource(peers=2, kt=stiffness, cube=0.3), Law(loss, 1 - loss))
@@ -63,12 +63,12 @@ def test_derivatives_are_those_of_moments_followed_event_by_event() -> None:
 @pytest.mark.whole
 @pytest.mark.parametrize("loss", ["{p: 1.1 %, r: 10 %}", "100 %"])
 def test_where_one_value_takes_long_or_is_not_judged_margins_say_so(loss: str) -> None:
-    system = system_of(topology(3, 500.0, loss=loss))
-    reported = grown(system)
+    model = system_of(topology(3, 500.0, loss=loss))
+    reported = grown(model)
     assert not reported.rows and re.match(
         r"not computed: (one mean-square analysis|the mean-square verdict)", reported.note
     )
-    why = network_sensitivities(numeric_model(system)).note
+    why = network_sensitivities(numeric_model(model)).note
     assert why.startswith("sensitivities not computed")
 
 
@@ -107,12 +107,12 @@ def test_what_is_left_open_of_a_box_is_said() -> None:
 
 @pytest.mark.needs_extension("parameter_boxes")
 def test_of_an_ideal_link_a_box_is_nominal_until_it_may_lose_packets() -> None:
-    system = system_of(topology(3, 500.0, loss="0 %"))
+    model = system_of(topology(3, 500.0, loss="0 %"))
     assert (
-        apc.robust_stability(system, {"contact.stiffness": "±1%"}).verdict
+        apc.robust_stability(model, {"contact.stiffness": "±1%"}).verdict
         == "stable up to a common translation"
     )
-    assert apc.robust_stability(system, {"lan.loss": "0 %:2 %"}).verdict == "stable in mean square"
+    assert apc.robust_stability(model, {"lan.loss": "0 %:2 %"}).verdict == "stable in mean square"
 
 
 @pytest.mark.needs_extension("parameter_boxes")

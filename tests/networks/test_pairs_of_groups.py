@@ -62,9 +62,9 @@ TWO_LINKS = replaced(
 )
 
 
-def poles(system: Model) -> NDArray[np.complex128]:
+def poles(model: Model) -> NDArray[np.complex128]:
     """Return the eigenvalues of the nominal network that are not 0."""
-    values = np.array([one.eigenvalue for one in apc.analyze(system).modes for _ in range(one.multiplicity)])
+    values = np.array([one.eigenvalue for one in apc.analyze(model).modes for _ in range(one.multiplicity)])
     return values[np.abs(values) > 1e-6]
 
 
@@ -75,8 +75,8 @@ def distance(one: Model, other: Model) -> float:
     return float(between[linear_sum_assignment(between)].max())
 
 
-def growth(system: Model) -> float:
-    found = apc.mean_square_stability(system)
+def growth(model: Model) -> float:
+    found = apc.mean_square_stability(model)
     assert found is not None and found.exact and found.mean_square_radius is not None, found
     return found.mean_square_radius
 
@@ -120,8 +120,8 @@ def test_second_moments_are_those_of_all_patterns_of_loss(
     text = text_of(TopologySource(peers=2, users=({}, {})))
     (one, other), (there, back) = losses, late
     pairs = f"u1: {{u2: {{delay: {there} ms, loss: {one}}}}}, u2: {{u1: {{delay: {back} ms, loss: {other}}}}}"
-    system = compiled(replaced(text, ("delay: 8 ms}", f"delay: 8 ms, pairs: {{{pairs}}}}}")))
-    assert growth(system) == pytest.approx(moments(losses, late), rel=1e-8)
+    model = compiled(replaced(text, ("delay: 8 ms}", f"delay: 8 ms, pairs: {{{pairs}}}}}")))
+    assert growth(model) == pytest.approx(moments(losses, late), rel=1e-8)
 
 
 def test_a_pair_is_set_without_compiling() -> None:
@@ -301,7 +301,7 @@ def test_the_age_of_packets_is_known_if_pairs_differ_in_loss_only() -> None:
 )
 def test_a_pair_or_a_key_that_is_missing_is_not_another_one(name: str, entry: str) -> None:
     """The pair from the lab has a delay and a loss; what is missing is written into the topology."""
-    system = compiled(replaced(PAIRS, (f", far: {{lab: {{{WAN}}}}}", "")))
+    model = compiled(replaced(PAIRS, (f", far: {{lab: {{{WAN}}}}}", "")))
     with pytest.raises(ApcError, match=r"E622 .* is not in the topology") as error:
-        apc.set_parameters(system, {f"lan.pairs.{name}": "1 ms"})
+        apc.set_parameters(model, {f"lan.pairs.{name}": "1 ms"})
     assert error.value.mistakes[0].fix == f"links: {{lan: {{pairs: {{{entry}}}}}}}"

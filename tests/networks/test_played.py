@@ -22,20 +22,20 @@ def rows_of(simulation: Simulation, run: int = 0) -> NDArray[np.float64]:
     return np.concatenate([block.values for block in blocks(simulation, run=run)])
 
 
-def played(system: Model, *, duration: Fraction = Fraction(1), seed: int = 0) -> NDArray[np.float64]:
-    return rows_of(prepare(system, Settings(duration, jit=False, seed=seed)))
+def played(model: Model, *, duration: Fraction = Fraction(1), seed: int = 0) -> NDArray[np.float64]:
+    return rows_of(prepare(model, Settings(duration, jit=False, seed=seed)))
 
 
-def scattered(system: Model) -> Model:
+def scattered(model: Model) -> Model:
     """Return a system whose peers all start elsewhere."""
     random = np.random.default_rng(1)
     groups = []
-    for group in system.groups:
-        starts = [one.start for one in system.peer_types[group.peer_type].states if one.unit == "m"]
+    for group in model.groups:
+        starts = [one.start for one in model.peer_types[group.peer_type].states if one.unit == "m"]
         columns = tuple(PeerColumn(name, random.uniform(-0.01, 0.01, group.count)) for name in starts)
         stored = tuple(value for value in group.values if value.name not in starts)
         groups.append(replace(group, values=stored, columns=columns))
-    return replace(system, groups=tuple(groups))
+    return replace(model, groups=tuple(groups))
 
 
 # Weights, a slow clock and a delay of its own between two groups.
@@ -106,11 +106,11 @@ def test_a_link_that_loses_everything_leaves_every_copy_where_it_is_or_holds_the
 
 @pytest.mark.whole
 def test_the_same_seed_gives_the_same_rows_however_long_the_chunks_are() -> None:
-    system = compiled(apart(AVERAGE, "loss: 20 %, jitter: 9 ms, distribution: pareto, reorder: all"))
-    long, short = (prepare(system, Settings(Fraction(time), jit=False, seed=1)) for time in ("3", "1/10"))
+    model = compiled(apart(AVERAGE, "loss: 20 %, jitter: 9 ms, distribution: pareto, reorder: all"))
+    long, short = (prepare(model, Settings(Fraction(time), jit=False, seed=1)) for time in ("3", "1/10"))
     assert short.length != long.length
     one, other = rows_of(long), rows_of(short)
     assert one[: len(other)].tolist() == other.tolist()
     assert rows_of(replace(short, length=3)).tolist() == other.tolist()
-    assert np.abs(played(system, duration=Fraction(3), seed=2) - one).max() > 1e-3
+    assert np.abs(played(model, duration=Fraction(3), seed=2) - one).max() > 1e-3
     assert np.abs(rows_of(long, run=1) - one).max() > 1e-3

@@ -176,10 +176,10 @@ def test_a_model_of_somebody_else_needs_no_file_beside_it_and_not_this_library(
 def test_what_was_changed_before_it_was_saved_is_changed_again(other: Other) -> None:
     write("topology.yaml", AVERAGE)
     numbers = {"contact.stiffness": "800 N/m", "lan.delay": "5/3 ms", "user.count": "5"}
-    system = apc.set_parameters(apc.with_hands(apc.compile("topology.yaml"), "held"), numbers)
-    apc.save(system, MODEL)
-    assert store.encoded(apc.load(MODEL)) == store.encoded(system)
-    assert store.encoded(other()) == store.encoded(system)
+    model = apc.set_parameters(apc.with_hands(apc.compile("topology.yaml"), "held"), numbers)
+    apc.save(model, MODEL)
+    assert store.encoded(apc.load(MODEL)) == store.encoded(model)
+    assert store.encoded(other()) == store.encoded(model)
 
 
 SECRETS = ("secret.csv", "../secret.csv", "/dev/zero", "/etc/passwd")

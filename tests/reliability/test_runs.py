@@ -137,7 +137,7 @@ def test_a_run_is_not_written_to_where_links_in_its_folder_lead(stored: Path, tm
     for name in names:
         (stored / name).unlink()
         (stored / name).symlink_to(mine)
-    write_run(stored, found.system, found.peers)
+    write_run(stored, found.model, found.peers)
     assert mine.read_text() == "mine"
     assert len(read_run(stored).peers) == 2
 

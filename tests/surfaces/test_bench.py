@@ -172,8 +172,8 @@ def test_every_topology_has_its_truth_and_says_where_it_comes_from_and_what_is_h
 @pytest.mark.few(8)
 @pytest.mark.parametrize("name", NAMES)
 def test_a_hard_case_gets_the_right_verdict_and_a_bound_that_holds(name: str) -> None:
-    system = apc.compile(HERE / f"{name}.yaml")
-    case = compare(system, apc.analyze(system), STORED[name], 0.0, name)
+    model = apc.compile(HERE / f"{name}.yaml")
+    case = compare(model, apc.analyze(model), STORED[name], 0.0, name)
     assert case.failed == ""
     assert case.verdict == STORED[name]["verdict"], "none of these is left undecided"
     assert math.isfinite(case.bound)
@@ -222,8 +222,8 @@ OPEN = "the bound is infinite; the verdict is undecided; expected: stable up to 
 def test_what_is_no_number_or_no_verdict_fails_and_is_counted(
     changes: dict[str, object], failed: str, cli: Cli
 ) -> None:
-    def solve(system: Model) -> apc.Analysis:
-        return replace(apc.analyze(system), **changes)  # type: ignore[arg-type] # some fields of it
+    def solve(model: Model) -> apc.Analysis:
+        return replace(apc.analyze(model), **changes)  # type: ignore[arg-type] # some fields of it
 
     _one_case()
     report = run_hard_cases(Path(), solve=solve, repeats=1)

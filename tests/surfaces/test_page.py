@@ -77,11 +77,11 @@ def named(sliders: tuple[Slider, ...], label: str) -> Slider:
     "name", ["three-users-average", "experiment-average", "mixed-clocks", "lossy-average"]
 )
 def test_what_a_slider_says_is_what_set_takes(name: str) -> None:
-    system = apc.compile(TOPOLOGIES / f"{name}.yaml")
-    for one in sliders_of(system):
+    model = apc.compile(TOPOLOGIES / f"{name}.yaml")
+    for one in sliders_of(model):
         assert list(one.values) == sorted(set(one.values)), one.label
         for value, text in zip(one.values, one.texts, strict=True):
-            assert parse_override(system, f"{one.label}={text}").value == value
+            assert parse_override(model, f"{one.label}={text}").value == value
 
 
 def test_every_number_of_the_paper_s_topology_has_a_slider(tmp_path: Path) -> None:
@@ -104,9 +104,9 @@ def test_every_number_of_the_paper_s_topology_has_a_slider(tmp_path: Path) -> No
 
 
 def test_a_value_that_a_slider_has_not_gets_a_place_of_its_own(tmp_path: Path) -> None:
-    system = compiled(AVERAGE, tmp_path)
-    sliders = sliders_of(system)
-    place, value = set_to(system, sliders, "contact.stiffness=1234.5 N/m")
+    model = compiled(AVERAGE, tmp_path)
+    sliders = sliders_of(model)
+    place, value = set_to(model, sliders, "contact.stiffness=1234.5 N/m")
     moved, at = with_value(sliders[place], value)
     assert moved.texts[at] == "1234.5 N/m" and moved.values[moved.start] == 1000
     (override,) = overrides_of([moved], [at])
@@ -117,11 +117,11 @@ def test_a_value_that_a_slider_has_not_gets_a_place_of_its_own(tmp_path: Path) -
 
 def test_what_follows_from_others_has_no_slider(tmp_path: Path) -> None:
     text = AVERAGE.replace("stiffness: 500 N/m", "stiffness: kt/(peers - 1)")
-    system = compiled(text.replace("clocks:", "parameters: {kt: 1000 N/m}\nclocks:"), tmp_path)
-    sliders = sliders_of(system)
+    model = compiled(text.replace("clocks:", "parameters: {kt: 1000 N/m}\nclocks:"), tmp_path)
+    sliders = sliders_of(model)
     assert "kt" in [one.label for one in sliders]
     with pytest.raises(apc.ApcError, match=r"E980 coordination\.stiffness has no slider"):
-        set_to(system, sliders, "coordination.stiffness=500 N/m")
+        set_to(model, sliders, "coordination.stiffness=500 N/m")
 
 
 # What is computed.
@@ -129,8 +129,8 @@ def test_what_follows_from_others_has_no_slider(tmp_path: Path) -> None:
 
 @pytest.mark.whole
 def test_sections_tell_what_the_api_tells(tmp_path: Path) -> None:
-    system = compiled(AVERAGE, tmp_path)
-    sliders, model = sliders_of(system), model_bytes(system)
+    compiled_model = compiled(AVERAGE, tmp_path)
+    sliders, model = sliders_of(compiled_model), model_bytes(compiled_model)
     places = [one.start for one in sliders]
     places[sliders.index(named(sliders, "lan.delay"))] += 40
     overrides = tuple(overrides_of(sliders, places))
@@ -141,15 +141,15 @@ def test_sections_tell_what_the_api_tells(tmp_path: Path) -> None:
         assert answer is not None
         return answer
 
-    analysis, whole = apc.analyze(system, params=setting), apc.region(system, params=setting)
+    analysis, whole = apc.analyze(compiled_model, params=setting), apc.region(compiled_model, params=setting)
     verdict, transparency = report_of("verdict"), report_of("transparency")
     assert verdict["radius"] == analysis.spectral_radius and verdict["text"] == str(analysis)
     region = report_of("region", (*axes_of(sliders, places, (0, 1)), "nominal"))
     assert region["share"] == pytest.approx(whole.stable_area / (5000 * 1500), rel=1e-4)  # drawn to 1e-5
-    used = apc.transparency(system, transparency["frequency"], params=setting)
+    used = apc.transparency(compiled_model, transparency["frequency"], params=setting)
     assert np.array_equal(transparency["magnitude"], np.abs(used.impedance))
     best = apc.tune(
-        system, {"contact.stiffness": "0 N/m:5000 N/m"}, maximize="contact.stiffness", params=setting
+        compiled_model, {"contact.stiffness": "0 N/m:5000 N/m"}, maximize="contact.stiffness", params=setting
     )
     assert report_of("tune", (("contact.stiffness=0 N/m:5000 N/m",), "contact.stiffness"))["text"] == str(
         best
@@ -244,11 +244,11 @@ def test_an_old_answer_never_takes_the_place_of_a_newer_one() -> None:
     ],
 )
 def test_a_value_is_written_where_it_stands(label: str, value: str, line: str, tmp_path: Path) -> None:
-    system = compiled(AVERAGE, tmp_path)
-    text = with_values(AVERAGE, system, {ParameterRef(label): value})
+    model = compiled(AVERAGE, tmp_path)
+    text = with_values(AVERAGE, model, {ParameterRef(label): value})
     assert line in text
     changed = compiled(text, tmp_path)
-    expected = apc.analyze(system, params={label: value})
+    expected = apc.analyze(model, params={label: value})
     assert apc.analyze(changed).spectral_radius == pytest.approx(expected.spectral_radius, rel=1e-12)
     assert len(text.splitlines()) == len(AVERAGE.splitlines())  # and comments stay where they were
     assert "# a copy at each peer" in text
@@ -304,18 +304,18 @@ def tab(browser: Any, link: str) -> Iterator[Tab]:
 def test_a_slider_that_is_moved_changes_region_and_verdict_to_what_the_api_says(
     browser: Any, link: str, tab: Tab, tmp_path: Path
 ) -> None:
-    system = compiled(AVERAGE, tmp_path)
+    model = compiled(AVERAGE, tmp_path)
     first, second = Tab(browser, link), tab
-    first.radius(apc.analyze(system).spectral_radius)
+    first.radius(apc.analyze(model).spectral_radius)
     text = first.press("lan.delay", "PageUp", 3).replace("·", "*")
     setting = {"lan.delay": text}
     assert text != "8 ms"
-    first.radius(apc.analyze(system, params=setting).spectral_radius)
-    share = apc.region(system, params=setting).stable_area / (5000 * 1500)
+    first.radius(apc.analyze(model, params=setting).spectral_radius)
+    share = apc.region(model, params=setting).stable_area / (5000 * 1500)
     first.page.wait_for_function(f"{MODEL}('region-words').text.includes('{100 * share:.3g} %')")
     # An axis of the region: the point moves, and the verdict becomes another.
     text = first.press("contact.stiffness", "End", 1).replace("·", "*")
-    found = apc.analyze(system, params=setting | {"contact.stiffness": text})
+    found = apc.analyze(model, params=setting | {"contact.stiffness": text})
     assert found.stable is False
     first.radius(found.spectral_radius)
     assert "class='unstable'" in first.page.evaluate(VERDICT)
@@ -327,7 +327,7 @@ def test_a_slider_that_is_moved_changes_region_and_verdict_to_what_the_api_says(
     third = Tab(browser, url)
     third.radius(found.spectral_radius)
     third.close(link)
-    second.radius(apc.analyze(system).spectral_radius)
+    second.radius(apc.analyze(model).spectral_radius)
     assert second.press("lan.delay", "Tab", 1) == "8 ms"
     second.check(link)
 
@@ -384,13 +384,11 @@ def test_a_topology_without_two_axes_is_shown_without_a_region(browser: Any, tmp
 def test_a_topology_may_name_its_numbers_as_the_link_does(browser: Any, tmp_path: Path) -> None:
     text = AVERAGE.replace("clocks:", "parameters: {x: 1000 N/m, y: 500 N/m, token: 5 N*s/m}\nclocks:", 1)
     text = text.replace("stiffness: 1000 N/m", "stiffness: x").replace("stiffness: 500 N/m", "stiffness: y")
-    system = compiled(
-        text.replace("mass: 0.1 kg, damping: 5 N*s/m", "mass: 0.1 kg, damping: token"), tmp_path
-    )
+    model = compiled(text.replace("mass: 0.1 kg, damping: 5 N*s/m", "mass: 0.1 kg, damping: token"), tmp_path)
     with served(tmp_path / "topology.yaml") as link:
         tab = Tab(browser, link)
         setting = {name: tab.press(name, "PageDown", 1).replace("·", "*") for name in ("x", "token")}
-        radius = apc.analyze(system, params=setting).spectral_radius
+        radius = apc.analyze(model, params=setting).spectral_radius
         tab.radius(radius)
         tab.page.wait_for_function("new URLSearchParams(location.search).getAll('token').length == 2")
         url = tab.page.url
@@ -493,10 +491,10 @@ def test_figures_are_hidden_until_their_result_is_there() -> None:
 
 
 def test_peaks_of_an_impedance_are_resolved_and_inside_the_axes(tmp_path: Path) -> None:
-    system = compiled(AVERAGE, tmp_path)
-    reported = compute(model_bytes(system), Task("transparency", (), "")).result
+    model = compiled(AVERAGE, tmp_path)
+    reported = compute(model_bytes(model), Task("transparency", (), "")).result
     assert reported is not None
-    dense = np.abs(apc.transparency(system, np.geomspace(0.1, 60, 1500)).impedance)
+    dense = np.abs(apc.transparency(model, np.geomspace(0.1, 60, 1500)).impedance)
     assert reported["magnitude"].max() > 0.99 * dense.max()
     figure = TransparencyFigure()
     figure.show(reported)
@@ -510,9 +508,9 @@ def test_a_named_parameter_has_a_range_by_its_margin_within_the_limits_of_what_d
     tmp_path: Path,
 ) -> None:
     text = AVERAGE.replace("clocks:", "parameters: {k: 100 N/m}\nclocks:", 1).partition("studies:")[0]
-    system = compiled(text.replace("stiffness: 500 N/m", "stiffness: k"), tmp_path)
-    slider = named(sliders_of(system), "k")
-    limit = apc.critical(system, "k").value
+    model = compiled(text.replace("stiffness: 500 N/m", "stiffness: k"), tmp_path)
+    slider = named(sliders_of(model), "k")
+    limit = apc.critical(model, "k").value
     assert slider.span is not None and limit is not None
     assert slider.span[0] == 0 == slider.values[0] and limit < slider.span[1] < 3 * limit
 
@@ -521,12 +519,12 @@ def test_an_unreliable_topology_opens_with_mean_square_stability(tmp_path: Path)
     opened = tab_of(compiled(LOSSY, tmp_path))
     assert opened.criterion_select.value.startswith("mean-square")
     verdict = next(task for task in Asked.requested if task.section == "verdict")
-    reported = compute(model_bytes(opened.system), verdict).result
+    reported = compute(model_bytes(opened.model), verdict).result
     assert reported is not None and reported["measure"] == "second-moment growth"
     assert tab_of(compiled(AVERAGE, tmp_path)).criterion_select.value.startswith("nominal")
 
 
-def tab_of(system: Model) -> TopologyTab:
+def tab_of(model: Model) -> TopologyTab:
     """Return the page of a tab without a browser, and without those who compute for it."""
     document, request = Document(), SimpleNamespace(arguments={})
     context = SimpleNamespace(request=request)
@@ -534,7 +532,7 @@ def tab_of(system: Model) -> TopologyTab:
     Asked.requested.clear()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("apc.app.page.SectionWorker", Asked)
-        return TopologyTab(topology_of(system, (), None), document)
+        return TopologyTab(topology_of(model, (), None), document)
 
 
 @pytest.fixture(scope="module")

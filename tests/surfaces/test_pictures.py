@@ -52,9 +52,9 @@ def _notes_of(figure: matplotlib.figure.Figure) -> str:
 
 
 def test_notes_on_regions_are_below_the_figure_once_and_optional() -> None:
-    system = compiled((TOPOLOGIES / "lossy-average.yaml").read_text(encoding="utf-8"))
+    model = compiled((TOPOLOGIES / "lossy-average.yaml").read_text(encoding="utf-8"))
     panels = compare_regions(
-        [system], x=X, y=Y, panels=(("cube.mass=0.6 kg",), ("cube.mass=1 kg",)), cells=4, criterion="nominal"
+        [model], x=X, y=Y, panels=(("cube.mass=0.6 kg",), ("cube.mass=1 kg",)), cells=4, criterion="nominal"
     )
     figure = panels.plot()
     note = panels.panels[0].regions[0].limitations[0]
@@ -79,9 +79,9 @@ def test_notes_on_regions_are_below_the_figure_once_and_optional() -> None:
 def test_axes_have_units_with_numbers_of_a_readable_size(
     topology: str, axis: str, label: str, ticks: tuple[float, float]
 ) -> None:
-    system = compiled((TOPOLOGIES / f"{topology}.yaml").read_text(encoding="utf-8"))
+    model = compiled((TOPOLOGIES / f"{topology}.yaml").read_text(encoding="utf-8"))
     y = "contact.stiffness=50 N/m:100 N/m" if topology == "lossy-average" else X  # stable everywhere
-    [found] = compare_regions([system], x=axis, y=y, cells=4).panels[0].regions
+    [found] = compare_regions([model], x=axis, y=y, cells=4).panels[0].regions
     ax = found.plot()
     ax.figure.draw_without_rendering()
     printed = [float(text.get_text()) for text in ax.get_xticklabels()]
@@ -178,8 +178,8 @@ def test_a_picture_has_the_size_words_and_style_that_are_asked_for() -> None:
 
 
 def test_a_root_locus_passes_the_circle_where_stability_changes() -> None:
-    system = compiled(AVERAGE)
-    critical = apc.critical(system, "coordination.stiffness")
+    model = compiled(AVERAGE)
+    critical = apc.critical(model, "coordination.stiffness")
     axes = critical.plot(size=(4, 3), labels={"real part": "Re"})
     assert axes.get_xlabel() == "Re" and tuple(axes.figure.get_size_inches()) == (4, 3)
     texts = [one.get_text() for one in axes.get_legend().get_texts()]
@@ -187,7 +187,7 @@ def test_a_root_locus_passes_the_circle_where_stability_changes() -> None:
     points = np.asarray(axes.collections[0].get_offsets()) @ [1, 1j]
     assert np.abs(points).max() > 1.01
     for value in (500, 1096):
-        modes = apc.analyze(system, params={"coordination.stiffness": f"{value} N/m"}).modes
+        modes = apc.analyze(model, params={"coordination.stiffness": f"{value} N/m"}).modes
         for mode in modes:
             assert np.abs(points - mode.eigenvalue).min() < 0.02
 

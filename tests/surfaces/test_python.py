@@ -43,8 +43,8 @@ def test_a_saved_model_analyses_as_the_one_it_was(model: apc.Model, tmp_path: Pa
 def test_setting_changes_a_copy_and_is_as_good_as_writing(model: apc.Model, tmp_path: Path) -> None:
     settings = {"coordination.stiffness": "5 N/mm", "lan.delay": "16 ms"}
     changed = apc.set_parameters(model, settings)
-    for system, value in ((changed, 5000), (model, 500)):
-        assert {p.name: p.value for p in system.parameters}["coordination.stiffness"] == value
+    for compiled_model, value in ((changed, 5000), (model, 500)):
+        assert {p.name: p.value for p in compiled_model.parameters}["coordination.stiffness"] == value
     path = tmp_path / "topology.yaml"
     text = PATH.read_text(encoding="utf-8")
     path.write_text(replaced(text, ("500 N/m,", "5 N/mm,"), ("delay: 8 ms", "delay: 16 ms")), "utf-8")

@@ -42,22 +42,20 @@ def changed(text: str, values: Mapping[str, str], tmp_path: Path) -> tuple[str, 
     """
     path = tmp_path / "t.yaml"
     path.write_bytes(text.encode())
-    system = apc.compile(path)
-    new = with_values(
-        text, system, {find(system, name, counts=True): value for name, value in values.items()}
-    )
+    model = apc.compile(path)
+    new = with_values(text, model, {find(model, name, counts=True): value for name, value in values.items()})
     path.write_bytes(new.encode())
     written = apc.compile(path)
-    meant = listed(apply(system, [parse_override(system, f"{n}={v}") for n, v in values.items()]))
+    meant = listed(apply(model, [parse_override(model, f"{n}={v}") for n, v in values.items()]))
     names = {name for name in (*meant, *listed(written)) if name.count(".") > 1}
     assert {name: listed(written).get(name) for name in names} == {name: meant.get(name) for name in names}
     return new, written
 
 
-def listed(system: Model) -> dict[str, tuple[float, float]]:
+def listed(model: Model) -> dict[str, tuple[float, float]]:
     """Return the range of each number by name, one of all groups once for each group."""
-    rows = {row.name: (row.low, row.high) for row in parameters(system).rows}
-    names = [group.name for group in system.groups]
+    rows = {row.name: (row.low, row.high) for row in parameters(model).rows}
+    names = [group.name for group in model.groups]
     whole = {name: span for name, span in rows.items() if name.partition(".")[0] not in names}
     return {f"{name}.{label}": span for name in names for label, span in whole.items()} | rows
 
@@ -189,12 +187,12 @@ def test_a_text_that_would_be_another_topology_is_refused_and_not_written(tmp_pa
     path, out = tmp_path / "t.yaml", tmp_path / "o.yaml"
     path.write_text(text, encoding="utf-8")
     out.write_text("mine", encoding="utf-8")
-    system = apc.compile(path)
+    model = apc.compile(path)
     with pytest.raises(ApcError, match=r"E702 device\.mass is given both by set and by the table"):
-        write_topology(out, text, system, {find(system, "device.mass"): "0.3 kg"})
+        write_topology(out, text, model, {find(model, "device.mass"): "0.3 kg"})
     (tmp_path / "else").mkdir()
     with pytest.raises(ApcError, match=r"users\.csv"):  # which is not beside what is written
-        write_topology(tmp_path / "else" / "o.yaml", text, system, {find(system, K): "400 N/m"})
+        write_topology(tmp_path / "else" / "o.yaml", text, model, {find(model, K): "400 N/m"})
     assert out.read_text(encoding="utf-8") == "mine" and not list((tmp_path / "else").iterdir())
 
 
@@ -202,10 +200,10 @@ def test_a_text_that_would_be_another_topology_is_refused_and_not_written(tmp_pa
 @pytest.mark.parametrize("path", sorted(TOPOLOGIES.glob("*.yaml")), ids=lambda path: path.stem)
 def test_of_every_number_of_every_shipped_topology_only_that_one_changes(path: Path) -> None:
     """The writer compiles what it wrote and compares every number, or raises."""
-    system, text = apc.compile(path), path.read_text(encoding="utf-8")
-    columns = {column.name for group in system.groups for column in group.columns}  # of a table
+    model, text = apc.compile(path), path.read_text(encoding="utf-8")
+    columns = {column.name for group in model.groups for column in group.columns}  # of a table
     written = 0
-    for row in parameters(system).rows:
+    for row in parameters(model).rows:
         value = Fraction(repr(row.low)) * Fraction(11, 10) or Fraction(1, 8)
         if row.name.endswith(".count"):
             value = Fraction(row.low) + 1
@@ -217,13 +215,13 @@ def test_of_every_number_of_every_shipped_topology_only_that_one_changes(path: P
             continue
         quantity = f"{float(value):.9g} {row.unit}".removesuffix(" 1")
         try:
-            override = parse_override(system, f"{row.name}={quantity}")
-            apply(system, [override])
+            override = parse_override(model, f"{row.name}={quantity}")
+            apply(model, [override])
         except ApcError:
             continue  # of two numbers that are one only together, as phase and period
-        new = with_values(text, system, {override.free: quantity})
+        new = with_values(text, model, {override.free: quantity})
         written += 1
-        assert sum(line not in text.splitlines() for line in new.splitlines()) <= len(system.groups) + 1
+        assert sum(line not in text.splitlines() for line in new.splitlines()) <= len(model.groups) + 1
     assert written
 
 

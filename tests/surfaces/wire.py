@@ -102,7 +102,7 @@ class Other:
 
 def loop_at(
     wire: Wire,
-    system: Model,
+    model: Model,
     digest: bytes,
     secret: bytes,
     duration: str = "1/10",
@@ -110,10 +110,10 @@ def loop_at(
     stop: Any = None,
 ) -> PeerLoop:
     """Return the first peer of a topology at a wire, where the others are known."""
-    names = [f"{group.name}[{at + 1}]" for group in system.groups for at in range(group.count)]
+    names = [f"{group.name}[{at + 1}]" for group in model.groups for at in range(group.count)]
     others = {name: (OWN[0], OWN[1] + at) for at, name in enumerate(names) if at}
     return PeerLoop(
-        system,
+        model,
         names[0],
         wire,  # type: ignore[arg-type] # it stands for a socket
         others,

@@ -25,11 +25,11 @@ experiment: {duration: 1 s}
 
 
 def test_an_exact_topology_is_off_by_roundings_and_the_estimate_is_no_less() -> None:
-    system = compiled(SPRING)
-    found = simulate(system, error=True, jit=False)
+    model = compiled(SPRING)
+    found = simulate(model, error=True, jit=False)
     assert found.error is not None
     assert found.error.kind == "rounding"
-    followed = exact_course(system, Fraction(1))
+    followed = exact_course(model, Fraction(1))
     assert not isinstance(followed, str), followed
     made = np.abs(found.values[:, :2] - followed[1]).max(axis=0)
     reported = np.array([one.error for one in found.error.signals[:2]])
@@ -40,10 +40,10 @@ def test_an_exact_topology_is_off_by_roundings_and_the_estimate_is_no_less() -> 
 @pytest.mark.few(3)
 @pytest.mark.parametrize("method", ["rk4:1ms", "semi-implicit:0.1ms", "cvodes:1e-7", "rk4:0.3ms"])
 def test_the_estimate_of_a_linear_topology_is_its_distance_from_the_exact_motion(method: str) -> None:
-    system = compiled(replaced(AVERAGE, ("{count: 3}", "{count: 3, set: {device.x: [9 mm, 0 mm, 0 mm]}}")))
+    model = compiled(replaced(AVERAGE, ("{count: 3}", "{count: 3, set: {device.x: [9 mm, 0 mm, 0 mm]}}")))
     duration = Fraction(1, 10)
-    exact = simulate(system, duration=duration, jit=False)
-    found = simulate(system, duration=duration, method=parse_method(method), error=True, jit=False)
+    exact = simulate(model, duration=duration, jit=False)
+    found = simulate(model, duration=duration, method=parse_method(method), error=True, jit=False)
     assert found.error is not None
     made = np.abs(found.values - exact.values).max(axis=0)
     reported = np.array([one.error for one in found.error.signals])
@@ -51,11 +51,11 @@ def test_the_estimate_of_a_linear_topology_is_its_distance_from_the_exact_motion
 
 
 def test_the_estimate_of_a_contact_is_its_distance_from_a_far_tighter_run() -> None:
-    system = compiled(CROSSLEY)
+    model = compiled(CROSSLEY)
     length = Fraction(1, 20)
-    best = simulate(system, duration=length, method=parse_method("cvodes:1e-12"), jit=False).values
+    best = simulate(model, duration=length, method=parse_method("cvodes:1e-12"), jit=False).values
     for method in ("cvodes:1e-7", "rk4:0.05ms"):
-        found = simulate(system, duration=length, method=parse_method(method), error=True, jit=False)
+        found = simulate(model, duration=length, method=parse_method(method), error=True, jit=False)
         assert found.error is not None
         made = np.abs(found.values - best).max(axis=0)
         reported = np.array([one.error for one in found.error.signals])

@@ -87,13 +87,13 @@ def test_hunt_and_crossleys_impact_is_that_of_an_independent_integration() -> No
 
         return law
 
-    system = compiled(CROSSLEY)
-    found = simulate(system, jit=False)
+    model = compiled(CROSSLEY)
+    found = simulate(model, jit=False)
     true = dense_output(laws, [-0.005, 0.5], found.time)
     assert np.abs(found.values - true).max(axis=0) == pytest.approx([0, 0], abs=3e-7)
     assert np.abs(found.values[:, 0] - true[:, 0]).max() < 2e-9
     loose, tight = (
-        np.abs(simulate(system, method=Method("cvodes", tolerance=one), jit=False).values - true).max()
+        np.abs(simulate(model, method=Method("cvodes", tolerance=one), jit=False).values - true).max()
         for one in (1e-6, 1e-12)
     )
     assert 1e-5 < loose < 1e-2
@@ -137,8 +137,8 @@ F = ", f: {unit: 1, start: 0}"
 
 def test_a_motion_that_is_not_linear_feels_held_forces_from_when_they_act() -> None:
     # With y = x - 1: y' = f - y^2, f = 1 from half a tick on. Until then 1/y grows by t, then y is a coth.
-    system = alone("hold(f, delay) - (x - 1)^2", "f = 0*sample(x) + 1", variables=F, delay="0.5 ms")
-    found = simulate(system, duration=Fraction(1, 100), jit=False)
+    model = alone("hold(f, delay) - (x - 1)^2", "f = 0*sample(x) + 1", variables=F, delay="0.5 ms")
+    found = simulate(model, duration=Fraction(1, 100), jit=False)
     expected = 1 + 1 / np.tanh(found.time[1:] - 5e-4 + np.arctanh(-1 + 5e-4))
     assert found["peer[1].it.x"][1:] == pytest.approx(expected, rel=1e-8)
 
@@ -172,8 +172,8 @@ def columns(trajectory: Trajectory, start: str) -> np.ndarray:
 
 
 def test_linear_peers_and_parts_keep_their_exact_motion() -> None:
-    system = compiled(MIXED)
-    found = simulate(system, jit=False)
+    model = compiled(MIXED)
+    found = simulate(model, jit=False)
     assert [one.state for one in found.provenance.tolerances] == ["device.x", "device.v"]
     linear = MIXED.replace("  hard: {count: 1, set: {device.x: -1 mm, device.v: 0.5 m/s}}\n", "")
     linear = "".join(line for line in linear.splitlines(True) if "contact" not in line)
@@ -208,15 +208,15 @@ def test_a_linear_topology_converges_to_the_exact_one_with_the_order_of_the_meth
     method: str, order: int
 ) -> None:
     moved = replaced(AVERAGE, ("{count: 3}", "{count: 3, set: {device.x: [10 mm, 0 mm, -5 mm]}}"))
-    system = compiled(moved.replace("delay: 1 ms", "delay: 0.3 ms"))  # steps end at 0.3 ms of each tick
+    model = compiled(moved.replace("delay: 1 ms", "delay: 0.3 ms"))  # steps end at 0.3 ms of each tick
 
     def error(step: str) -> float:
         found = simulate(
-            system, duration=MS * 20, signals=["*.x"], method=parse_method(f"{method}:{step}"), jit=False
+            model, duration=MS * 20, signals=["*.x"], method=parse_method(f"{method}:{step}"), jit=False
         )
         return float(np.abs(found.values - exact.values).max())
 
-    exact = simulate(system, duration=MS * 20, signals=["*.x"], jit=False)
+    exact = simulate(model, duration=MS * 20, signals=["*.x"], jit=False)
     assert exact.provenance.method == "exact"
     assert np.log2(error("100us") / error("25us")) / 2 == pytest.approx(order, abs=0.15)
 

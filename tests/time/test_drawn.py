@@ -60,8 +60,8 @@ equations: ["b.x = at_"]
 
 
 def test_every_peer_has_a_plane_of_its_own_to_one_scale(tmp_path: Path) -> None:
-    system = compiled(PUCK, library(tmp_path, PEG))
-    axes = draw_actors(system)[0].axes
+    model = compiled(PUCK, library(tmp_path, PEG))
+    axes = draw_actors(model)[0].axes
     assert [one.get_title() for one in axes] == ["user[1]", "user[2]", "user[3]"]
     assert len({(one.get_xlim(), one.get_ylim()) for one in axes}) == 1
     (left, right), (low, high) = axes[0].get_xlim(), axes[0].get_ylim()
@@ -72,11 +72,11 @@ def test_every_peer_has_a_plane_of_its_own_to_one_scale(tmp_path: Path) -> None:
 
 def test_a_held_body_reaches_to_its_grasp_point_and_a_line_joins_it_to_the_device() -> None:
     """The beam is held at 0.3 m from its middle, at the left end by one user, at the right by the other."""
-    system = topology("carried-beam")
-    arms = [view.contacts for view in views_of(system)]
+    model = topology("carried-beam")
+    arms = [view.contacts for view in views_of(model)]
     assert [[(one.holder, one.held) for one in contacts] for contacts in arms] == [[("device", "beam")]] * 2
     assert np.allclose([contacts[0].arm for contacts in arms], [(-0.3, 0), (0.3, 0)], rtol=0, atol=1e-9)
-    _, _, lines = draw_actors(system)
+    _, _, lines = draw_actors(model)
     for line, place in zip(lines, (-300, 300), strict=True):
         assert np.allclose(line.line.get_xydata(), [(place, 0)] * 2, rtol=0, atol=1e-6)
         line.held.move([10.0, 20.0], math.pi / 2)

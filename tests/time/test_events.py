@@ -52,12 +52,12 @@ def test_the_papers_experiment_is_what_stepping_it_by_hand_gives(
     assert np.abs(users(found, 3) - expected).max() < tolerance
 
 
-def check_followed(system: Model, duration: Fraction) -> None:
+def check_followed(model: Model, duration: Fraction) -> None:
     """Check a run against the course that the independent engine follows in balls."""
-    followed = exact_course(system, duration)
+    followed = exact_course(model, duration)
     assert not isinstance(followed, str), followed
     names, rows = followed
-    found = simulate(system, duration=duration, signals=names, jit=False)
+    found = simulate(model, duration=duration, signals=names, jit=False)
     assert [one.name for one in found.signals] == [*names]
     assert np.ptp(rows, axis=0).max() > 1e-4
     assert np.abs(found.values - rows).max() < 1e-12 * max(1.0, np.abs(rows).max())
@@ -90,9 +90,9 @@ def test_delays_of_any_length_act_when_they_should(text: str, graph: str, comp: 
 @pytest.mark.few(2)
 @pytest.mark.parametrize("topology", ["mixed-clocks", "users-table", "star-lecture"])
 def test_groups_tables_and_clocks_are_followed(topology: str) -> None:
-    system = compile_topology(TOPOLOGIES / f"{topology}.yaml")
-    group = system.groups[0].name
-    check_followed(apply(system, [parse_override(system, f"{group}.device.x=10 mm")]), Fraction(1, 20))
+    model = compile_topology(TOPOLOGIES / f"{topology}.yaml")
+    group = model.groups[0].name
+    check_followed(apply(model, [parse_override(model, f"{group}.device.x=10 mm")]), Fraction(1, 20))
 
 
 MOVING = replaced(AVERAGE, ("{count: 3}", MOVED))
@@ -112,24 +112,24 @@ LIMITED = replaced(MESH, ("{count: 3}", MOVED), ("type: FullMesh", "type: Satura
     ids=["experiment", "bursts", "pairs"],
 )
 def test_machine_code_and_the_virtual_machine_give_the_same(text: str) -> None:
-    system = compiled(text)
-    assert compiler() is None or prepare(system, Settings(Fraction(1))).library is not None
-    one, two = (simulate(system, jit=jit, duration=Fraction(1, 4)) for jit in (True, False))
+    model = compiled(text)
+    assert compiler() is None or prepare(model, Settings(Fraction(1))).library is not None
+    one, two = (simulate(model, jit=jit, duration=Fraction(1, 4)) for jit in (True, False))
     assert np.ptp(one.values, axis=0).max() > 1e-2
     assert np.abs(one.values - two.values).max() < 1e-12
 
 
 def test_a_clock_with_a_phase_ticks_late_and_the_first_row_is_at_time_0() -> None:
-    system = paper(haptic_phase=Fraction(1, 4000))
-    found = simulate(system, duration=3 * MS, jit=False)
+    model = paper(haptic_phase=Fraction(1, 4000))
+    found = simulate(model, duration=3 * MS, jit=False)
     assert found.time.tolist() == [0.0, 0.00025, 0.00125, 0.00225]
 
 
 def test_what_is_remembered_starts_at_its_start_value_and_acts_as_zero_before_it_is_computed() -> None:
     # y counts up by one a tick from its start value; what is held is y, late by one tick and a half.
     count = ", f: {unit: 1, start: 0}"
-    system = alone("hold(f, delay)", "f = previous(f) + 1", variables=count, delay="1.5 ms")
-    found = simulate(system, duration=5 * MS, jit=False)
+    model = alone("hold(f, delay)", "f = previous(f) + 1", variables=count, delay="1.5 ms")
+    found = simulate(model, duration=5 * MS, jit=False)
     assert found["peer[1].it.f"].tolist() == [0, 1, 2, 3, 4, 5]
     assert found["peer[1].it.f acting"].tolist() == [0, 0, 1, 2, 3, 4]
     expected = np.array([0, 0, 0.5, 2, 4.5, 8]) * 1e-3

@@ -124,9 +124,9 @@ def pushed(words: str, folder: Path, topology: str = TOPOLOGY) -> apc.Model:
 @pytest.mark.parametrize("what", PUSHES)
 def test_a_force_of_time_moves_a_mass_as_its_integral_says(what: str, tmp_path: Path) -> None:
     words, force, edges = PUSHES[what]
-    system = pushed(words, tmp_path)
+    model = pushed(words, tmp_path)
     length = Fraction(1, 10) if "many" not in what else Fraction(1, 50)
-    found = simulate(system, duration=length, jit=False)
+    found = simulate(model, duration=length, jit=False)
     assert found.provenance.method == "exact"
     for row in (8, 25) if "many" not in what else (1, 5):
         expected = by_quadrature(force, edges, Fraction(row, 250))
@@ -137,9 +137,9 @@ def test_a_topology_in_which_nothing_ticks_is_pushed_too(tmp_path: Path) -> None
     words, force, edges = PUSHES["a sine"]
     topology = TOPOLOGY.replace("clocks: {haptic: 4 ms}\n", "")
     head, _, rest = topology.partition("couplers:")
-    system = pushed(words, tmp_path, head + "hands:" + rest.partition("hands:")[2])
+    model = pushed(words, tmp_path, head + "hands:" + rest.partition("hands:")[2])
     expected = by_quadrature(force, edges, Fraction(1, 20))
-    found = simulate(system, duration=Fraction(1, 20), jit=False)
+    found = simulate(model, duration=Fraction(1, 20), jit=False)
     assert found.values[50] == pytest.approx(expected, rel=2e-14)
 
 
@@ -198,8 +198,8 @@ def test_peers_are_pushed_for_long_each_by_its_own_force_one_of_them_by_none(tmp
     """m v' + b v = F sin(ω t + φ): what is left after 10 s is the response to the sine alone."""
     peers = "count: 3, set: {push.force: [0 N, 2 N, 1 N], push.frequency: [3 Hz, 4 Hz, 500 Hz]}"
     topology = replaced(TOPOLOGY, ("count: 1, set: {device.x: 0.5 m, device.v: 0.125 m/s}", peers))
-    system = pushed("type: SineForce, force: 1 N, frequency: 1 Hz, phase: 0.5 rad", tmp_path, topology)
-    found = simulate(system, duration=Fraction(10), signals=["*.v"], jit=False)
+    model = pushed("type: SineForce, force: 1 N, frequency: 1 Hz, phase: 0.5 rad", tmp_path, topology)
+    found = simulate(model, duration=Fraction(10), signals=["*.v"], jit=False)
     for row in (2499, 2500):
         turn = 2 * np.pi * np.array([3, 4, 500])
         response = np.array([0, 2, 1]) / (1j * turn * MASS + DAMPING)
@@ -208,9 +208,9 @@ def test_peers_are_pushed_for_long_each_by_its_own_force_one_of_them_by_none(tmp
 
 
 def test_a_force_that_changes_without_end_is_refused(tmp_path: Path) -> None:
-    system = pushed("type: SineForce, force: 1 N, frequency: 1e9 Hz", tmp_path)
+    model = pushed("type: SineForce, force: 1 N, frequency: 1e9 Hz", tmp_path)
     with pytest.raises(ApcError, match=r"E871 a force changes too fast: .* more than 100 points"):
-        simulate(system, duration=Fraction(1, 10), jit=False)
+        simulate(model, duration=Fraction(1, 10), jit=False)
 
 
 def test_a_long_table_is_followed_row_by_row_and_costs_no_operation_a_row(tmp_path: Path) -> None:
@@ -223,10 +223,10 @@ def test_a_long_table_is_followed_row_by_row_and_costs_no_operation_a_row(tmp_pa
         forces = generator.normal(size=count)
         rows = "".join(f"{t!r},{f!r}\n" for t, f in zip(times.tolist(), forces.tolist(), strict=True))
         (tmp_path / "force.csv").write_text(f"time [s],force [N]\n{rows}", encoding="utf-8")
-        system = compile_topology(tmp_path / "topology.yaml")
-        [peer_type] = system.peer_types
+        model = compile_topology(tmp_path / "topology.yaml")
+        [peer_type] = model.peer_types
         lengths.append(peer_type.derivative.n_instructions())
-        found = simulate(system, duration=Fraction(1, 10), signals=["*.v"], jit=False)
+        found = simulate(model, duration=Fraction(1, 10), signals=["*.v"], jit=False)
         # m v' + b v = F, a line between rows: by quadrature on each of them.
         panels = np.unique(np.concatenate([[0.0], times[times < 0.1], [0.1]]))
         nodes, weights = np.polynomial.legendre.leggauss(8)

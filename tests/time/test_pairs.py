@@ -163,8 +163,8 @@ def punctual(delays: Callable[[int, int], int]) -> Late:
     return lambda i, j, tick: (max(-1, (tick - delays(i, j)) // 8), False)
 
 
-def check(system: Model, expected: NDArray[np.float64], *, seed: int = 0, jit: bool = False) -> None:
-    found = simulate(system, duration=DURATION, signals=["body.*"], jit=jit, seed=seed)
+def check(model: Model, expected: NDArray[np.float64], *, seed: int = 0, jit: bool = False) -> None:
+    found = simulate(model, duration=DURATION, signals=["body.*"], jit=jit, seed=seed)
     assert np.abs(expected).max() > 0.01
     # 300 steps: what rounding leaves, 1e-12 of the largest velocity.
     np.testing.assert_allclose(found.values, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
@@ -199,13 +199,13 @@ def test_each_pair_is_what_looking_at_every_packet_gives(
 ) -> None:
     """With one delay for all, or pairs of groups with delays of their own; only who is tied is looked at."""
     _, force = FORCES[name]
-    system = topology(tmp_path, name, f"delay: {delay}" + (f", graph: {graph}" if graph else ""))
+    model = topology(tmp_path, name, f"delay: {delay}" + (f", graph: {graph}" if graph else ""))
 
     def late(i: int, j: int) -> int:
         own = delay == OWN and i // 2 != j // 2
         return (19 if i < j else 2) if own else int(delay.partition(" ")[0])
 
-    check(system, by_hand(force, GRAPHS[graph], punctual(late)))
+    check(model, by_hand(force, GRAPHS[graph], punctual(late)))
 
 
 @pytest.mark.few(1)
@@ -223,8 +223,8 @@ def test_each_pair_is_what_looking_at_every_packet_gives(
 )
 def test_a_lost_packet_is_missed_by_its_pair_alone(tmp_path: Path, name: str, more: str, graph: str) -> None:
     _, force = FORCES[name]
-    system = topology(tmp_path, name, f"delay: 8 ms, {more}" + (f", graph: {graph}" if graph else ""))
-    law = channel_law(system, system.links[0], system.links[0].delay)
+    model = topology(tmp_path, name, f"delay: 8 ms, {more}" + (f", graph: {graph}" if graph else ""))
+    law = channel_law(model, model.links[0], model.links[0].delay)
     arcs = GRAPHS[graph]
     late = {arc: PacketSource(law, "lan", [arc], seed=3).take(50)[0].tolist() for arc in arcs}
 
@@ -233,7 +233,7 @@ def test_a_lost_packet_is_missed_by_its_pair_alone(tmp_path: Path, name: str, mo
 
     expected = by_hand(force, arcs, packet, zero="zero" in more)
     for jit in (False, True):
-        check(system, expected, seed=3, jit=jit)
+        check(model, expected, seed=3, jit=jit)
 
 
 @pytest.mark.few(2)
@@ -245,7 +245,7 @@ def test_each_pair_of_groups_loses_and_delays_by_its_own_law(tmp_path: Path, nam
     pairs = "near: {far: {loss: 40 %, on_loss: zero}}"
     pairs += ", far: {far: {loss: 0 %}, near: {delay: 19 ms, jitter: 6 ms}}"
     graphed = f", graph: {graph}" if graph else ""
-    system = topology(tmp_path, name, f"delay: 8 ms, loss: 10 %, pairs: {{{pairs}}}{graphed}")
+    model = topology(tmp_path, name, f"delay: 8 ms, loss: 10 %, pairs: {{{pairs}}}{graphed}")
     plain = ChannelLaw(0.1, 0.9, 1.0, 0.0, 0.008, 0.0, "uniform", None)
     laws = {
         (False, False): plain,
@@ -264,7 +264,7 @@ def test_each_pair_of_groups_loses_and_delays_by_its_own_law(tmp_path: Path, nam
 
     expected = by_hand(force, GRAPHS[graph], packet, zero=True)
     for jit in (False, True):
-        check(system, expected, seed=3, jit=jit)
+        check(model, expected, seed=3, jit=jit)
 
 
 def test_nobody_has_no_maximum(tmp_path: Path) -> None:

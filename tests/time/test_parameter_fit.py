@@ -330,8 +330,8 @@ def test_the_example_of_the_docstring_runs(monkeypatch: pytest.MonkeyPatch) -> N
 def test_half_of_the_rows_are_at_ticks_of_a_slower_clock(tmp_path: Path) -> None:
     """The force acts from all rows; the first row of the recording is time 0."""
     model = wall(0.5, 1.0, 0.0, 300.0)
-    system = apc.set_parameters(model, {"tick.period": 2 * PERIOD, MASS: 0.2})
-    true = apc.simulate(system, duration=0.4, signals=("device.x",))
+    compiled_model = apc.set_parameters(model, {"tick.period": 2 * PERIOD, MASS: 0.2})
+    true = apc.simulate(compiled_model, duration=0.4, signals=("device.x",))
     rows = np.interp(np.arange(201) * PERIOD, true.time, true["user[1].device.x"])
     path = table(tmp_path / "r.csv", {"device.x [m]": rows})
     lines = path.read_text(encoding="utf-8").splitlines()

@@ -138,8 +138,8 @@ def test_a_driven_motion_of_an_unstable_linear_topology_diverges(damping: float,
 
 @pytest.mark.parametrize("name", ["three-users-predicted", "two-users-dead-reckoning"])
 def test_the_age_of_a_packet_is_no_force_that_changes_with_time(name: str) -> None:
-    system, _ = initial_velocity(apc.compile(TOPOLOGIES / f"{name}.yaml"))
-    found = simulate(system, duration=Fraction(1), jit=False).summary
+    model, _ = initial_velocity(apc.compile(TOPOLOGIES / f"{name}.yaml"))
+    found = simulate(model, duration=Fraction(1), jit=False).summary
     assert (found.verdict, found.driven_until) == ("decays", 0.0)
 
 
@@ -148,9 +148,9 @@ def test_a_motion_that_does_not_excite_the_unstable_mode_is_not_determined() -> 
     text = AVERAGE.replace("stiffness: 500", "stiffness: 1500").replace(
         "{count: 3}", "{count: 3, set: {device.v: 0.1 m/s}}"
     )
-    system = compiled(text)
-    assert apc.analyze(system).stable is False
-    found = simulate(system, duration=Fraction(1, 2), jit=False)
+    model = compiled(text)
+    assert apc.analyze(model).stable is False
+    found = simulate(model, duration=Fraction(1, 2), jit=False)
     assert found.summary.verdict == "not determined"
     assert "apc analyze: unstable, growth time constant" in " ".join(str(found).split())
 
@@ -230,11 +230,11 @@ def test_pandas_and_xarray_hold_the_same_numbers() -> None:
 def test_signals_are_chosen_by_pattern_and_are_those_of_a_whole_run(
     patterns: list[str], names: list[str]
 ) -> None:
-    system = compiled(
+    model = compiled(
         replaced(AVERAGE, ("user: {count: 3}", "left: {count: 2, set: {cube.x: 1 cm}}\n  right: {count: 1}"))
     )
     found, whole = (
-        simulate(system, duration=Fraction(1, 20), signals=requested, jit=False)
+        simulate(model, duration=Fraction(1, 20), signals=requested, jit=False)
         for requested in (patterns, [])
     )
     assert [one.name for one in found.signals] == names
@@ -286,34 +286,34 @@ def test_a_method_is_read_with_its_step_exact_or_refused_in_one_line(text: str, 
 
 
 def test_a_step_that_the_topology_has_no_room_for_is_refused() -> None:
-    system = compiled(AVERAGE)
-    assert messages_of(check_step, system, Method("rk4", step=2 * MS), MS, MS) == [
+    model = compiled(AVERAGE)
+    assert messages_of(check_step, model, Method("rk4", step=2 * MS), MS, MS) == [
         "topology.yaml: E913 step of rk4: expected at most the period of the fastest clock, 1 ms, "
         "got 2 ms. Try: --method rk4:1ms"
     ]
-    [printed] = messages_of(check_step, system, Method("rk4", step=MS / 10**7), MS, MS)
+    [printed] = messages_of(check_step, model, Method("rk4", step=MS / 10**7), MS, MS)
     assert printed.startswith("topology.yaml: E913 step of rk4: expected at least 1e-06 ms,")
     for method in (Method("rk4", step=MS), DEFAULT):
-        check_step(system, method, MS, MS)
+        check_step(model, method, MS, MS)
 
 
 def test_a_run_is_as_long_as_is_said_and_no_longer_than_anyone_waits() -> None:
-    system = compiled(AVERAGE)
-    assert messages_of(simulate, system) == [
+    model = compiled(AVERAGE)
+    assert messages_of(simulate, model) == [
         "topology.yaml: E877 the topology has no duration. Try: experiment: {duration: 3 s}, "
         'or --duration "3 s"'
     ]
     with pytest.raises(ApcError, match=r"E877 duration: expected more than 0 s, got -1 s"):
-        simulate(system, duration=Fraction(-1))
+        simulate(model, duration=Fraction(-1))
     longest = MOST_ROWS * MS  # a row a tick
-    check_length(system, longest)
-    check_length(system, longest / 10, runs=10)
+    check_length(model, longest)
+    check_length(model, longest / 10, runs=10)
     requested = r'E915 duration: expected at most 1e\+06 s .* Try: --duration "1e\+06 s"'
     with pytest.raises(ApcError, match=requested):
-        check_length(system, longest + 1)
+        check_length(model, longest + 1)
     with pytest.raises(ApcError, match=r"at most 100000 s in each of 10 runs .*got 200000 s"):
-        check_length(system, longest / 5, runs=10)
-    long, short = (prepare(system, Settings(Fraction(one), jit=False)) for one in (10_000, 1))
+        check_length(model, longest / 5, runs=10)
+    long, short = (prepare(model, Settings(Fraction(one), jit=False)) for one in (10_000, 1))
     assert size_note(short, decimal=True) == ""
     assert size_note(long, decimal=False) == "will hold 10,000,000 rows of 25 columns, about 2 GB"
     assert size_note(long, decimal=True) == "will hold 10,000,000 rows of 25 columns, about 5 GB"

@@ -151,22 +151,22 @@ def test_a_box_stands_before_the_answer_and_says_that_more_cells_may_decide_it(
 def test_a_box_over_a_delay_is_stable_where_every_delay_in_it_is() -> None:
     noise = np.random.default_rng(4)
     for low, high in np.sort(noise.integers(0, 36, (6, 2)) / 2000, axis=1).tolist():
-        system = apc.set_parameters(compiled(AVERAGE), {"coordination.stiffness": noise.uniform(300, 1500)})
-        found = apc.robust_stability(system, {"lan.delay": (low, high + 0.0005)})
+        model = apc.set_parameters(compiled(AVERAGE), {"coordination.stiffness": noise.uniform(300, 1500)})
+        found = apc.robust_stability(model, {"lan.delay": (low, high + 0.0005)})
         grid = np.arange(low, high + 0.0006, 0.00025).round(7)
-        stable = [apc.analyze(system, params={"lan.delay": one}).stable for one in grid]
+        stable = [apc.analyze(model, params={"lan.delay": one}).stable for one in grid]
         assert found.stable is all(stable)
-        assert found.stable or not apc.analyze(system, params={"lan.delay": found.counterexample[0]}).stable
+        assert found.stable or not apc.analyze(model, params={"lan.delay": found.counterexample[0]}).stable
 
 
-def changing(system: apc.Model, low: float, high: float) -> Any:
-    return apc.robust_stability(system, {"lan.delay": (low, high)}).changing
+def changing(model: apc.Model, low: float, high: float) -> Any:
+    return apc.robust_stability(model, {"lan.delay": (low, high)}).changing
 
 
-def with_delays(system: apc.Model, delays: list[float]) -> float:
+def with_delays(model: apc.Model, delays: list[float]) -> float:
     """Return the least that a topology grows by a frame if its packets have these delays again and again."""
     channel = Channel(None, None, "uniform", "newest", "hold", np.array(delays))
-    recorded = replace(system, links=tuple(replace(link, channel=channel) for link in system.links))
+    recorded = replace(model, links=tuple(replace(link, channel=channel) for link in model.links))
     return trace_radius(numeric_model(recorded)).low
 
 
@@ -174,23 +174,23 @@ def test_where_a_changing_delay_is_proved_harmless_no_delays_met_are_unstable() 
     noise, proved = np.random.default_rng(3), 0
     for _ in range(8):
         numbers = {"coordination.stiffness": noise.uniform(200, 700), "user.count": int(noise.integers(2, 5))}
-        system = apc.set_parameters(compiled(AVERAGE), numbers)
-        if (found := changing(system, 0.008, 0.02)) is not None and found.proved_to is not None:
+        model = apc.set_parameters(compiled(AVERAGE), numbers)
+        if (found := changing(model, 0.008, 0.02)) is not None and found.proved_to is not None:
             proved += found.proved_to == 0.02
             ends = [0.008, found.proved_to]
-            assert max(with_delays(system, noise.choice(ends, k).tolist()) for k in range(1, 9)) < 1
+            assert max(with_delays(model, noise.choice(ends, k).tolist()) for k in range(1, 9)) < 1
     assert 3 <= proved < 8
 
 
 def test_delays_that_are_harmless_while_constant_are_unstable_by_turns() -> None:
     # By a program of its own, tick by tick: 0.99976 at most at constant delays, 1.0049 by turns.
     numbers = {"contact.stiffness": 320.589, "device.damping": 5.8966, "coordination.stiffness": 481.175}
-    system = apc.set_parameters(compiled(AVERAGE), {**numbers, "user.count": 2})
-    found = changing(system, 0.008, 0.046)
+    model = apc.set_parameters(compiled(AVERAGE), {**numbers, "user.count": 2})
+    found = changing(model, 0.008, 0.046)
     assert found.unstable == (2, 5)
-    assert with_delays(system, [0.008] * 2 + [0.046] * 5) == pytest.approx(1.004925, rel=1e-6)
+    assert with_delays(model, [0.008] * 2 + [0.046] * 5) == pytest.approx(1.004925, rel=1e-6)
     assert "unstable if 2 packets with 8 ms and 5 packets with 46 ms alternate" in " ".join(
-        str(apc.robust_stability(system, {"lan.delay": (0.008, 0.046)})).split()
+        str(apc.robust_stability(model, {"lan.delay": (0.008, 0.046)})).split()
     )
 
 
@@ -228,9 +228,9 @@ def test_delays_that_are_harmless_while_constant_are_unstable_by_turns() -> None
     ],
 )
 def test_a_box_that_can_not_be_is_refused_in_one_message(text: str, box: str, message: str) -> None:
-    system = compiled(text) if "\n" in text else apc.compile(TOPOLOGIES / f"{text}.yaml")
+    model = compiled(text) if "\n" in text else apc.compile(TOPOLOGIES / f"{text}.yaml")
     with pytest.raises(ApcError) as caught:
-        apc.robust_stability(system, dict(one.split("=") for one in box.split("|")))
+        apc.robust_stability(model, dict(one.split("=") for one in box.split("|")))
     [mistake] = caught.value.mistakes
     assert f"{mistake.code} {mistake.sentence}".startswith(message)
     assert "Try: contact.stiffness: " not in str(caught.value)
@@ -250,6 +250,6 @@ equations:
 """
     text = replaced(ONE_MASS, ("peers:", "clocks: {tick: 1 ms}\npeers:"))
     text += "couplers:\n  own: {type: Sum, a: device, b: ground, k: 100 N/m, ki: 0 N/m, clock: tick}\n"
-    system = compiled(text, library(tmp_path, part))
-    found = apc.robust_stability(system, {"own.k": "±1%"})
-    assert (found.verdict, found.stable, apc.analyze(system).verdict) == ("stable", True, "stable")
+    model = compiled(text, library(tmp_path, part))
+    found = apc.robust_stability(model, {"own.k": "±1%"})
+    assert (found.verdict, found.stable, apc.analyze(model).verdict) == ("stable", True, "stable")

@@ -59,13 +59,13 @@ def scheme(text: str) -> Scheme:
     ids=["average", "shaking", "lossy"],
 )
 def test_each_number_is_that_of_its_own_command(text: str) -> None:
-    system, found = compiled(text), scheme(text)
-    assert found.analysis == apc.analyze(system) and found.network == apc.mean_square_stability(system)
-    assert found.stiffness == apc.critical(system, "coordination.stiffness")
-    assert found.delay is None or found.delay == apc.critical(system, "lan.delay")
-    assert found.loss is None or found.loss == apc.critical(system, "lan.loss")
+    model, found = compiled(text), scheme(text)
+    assert found.analysis == apc.analyze(model) and found.network == apc.mean_square_stability(model)
+    assert found.stiffness == apc.critical(model, "coordination.stiffness")
+    assert found.delay is None or found.delay == apc.critical(model, "lan.delay")
+    assert found.loss is None or found.loss == apc.critical(model, "lan.loss")
     if found.transparency is not None:
-        used = apc.transparency(system, found.transparency.frequency_hz.tolist())
+        used = apc.transparency(model, found.transparency.frequency_hz.tolist())
         assert (
             np.array_equal(found.transparency.impedance, used.impedance) and found.transparency.at == used.at
         )
@@ -73,26 +73,26 @@ def test_each_number_is_that_of_its_own_command(text: str) -> None:
 
 @pytest.mark.whole
 def test_the_verdict_is_of_the_network_nominal_or_with_passive_hands_as_asked() -> None:
-    system = compiled(LOSSY)
+    model = compiled(LOSSY)
     assert scheme(LOSSY).verdict == "stable in mean square"
-    (nominal,) = apc.compare([system], criterion="nominal").schemes
+    (nominal,) = apc.compare([model], criterion="nominal").schemes
     assert (nominal.verdict, nominal.network) == ("stable up to a common translation", None)
-    assert nominal.delay == apc.critical(system, "lan.delay", criterion="nominal")
-    system = compiled(AVERAGE)
-    (found,) = apc.compare([system], criterion="passive").schemes
-    assert found.passive == apc.absolute_stability(system)
+    assert nominal.delay == apc.critical(model, "lan.delay", criterion="nominal")
+    model = compiled(AVERAGE)
+    (found,) = apc.compare([model], criterion="passive").schemes
+    assert found.passive == apc.absolute_stability(model)
     assert found.verdict == "unstable with some passive hands"
-    assert found.stiffness == apc.critical(system, "coordination.stiffness", criterion="passive")
+    assert found.stiffness == apc.critical(model, "coordination.stiffness", criterion="passive")
 
 
 @pytest.mark.whole
 def test_a_scheme_that_is_not_linear_is_judged_in_time_beside_its_linearization() -> None:
     """A wall is in no linearization about a start before it; in time 1 N rests 2 mm in 500 N/m."""
-    system = compiled(f"{BOUNCING}experiment: {{duration: 3 s}}\n")
-    found = apc.compare([system, compiled(AVERAGE)])
+    model = compiled(f"{BOUNCING}experiment: {{duration: 3 s}}\n")
+    found = apc.compare([model, compiled(AVERAGE)])
     (one, linear) = found.schemes
     assert one.analysis is not None and one.analysis.linearized and linear.simulated is None
-    played = apc.simulate(system)
+    played = apc.simulate(model)
     assert one.simulated is not None and one.simulated.to_dict() == played.to_dict()
     words = str(found).splitlines()
     place = words.index("Simulation") + 2

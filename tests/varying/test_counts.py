@@ -24,12 +24,12 @@ RING, STAR = (replaced(MESH, ("delay: 8 ms}", f"delay: 8 ms, graph: {name}}}")) 
 EDGES = "{edges: [[1, 2], [2, 3]]}"
 
 
-def plain(system: Model) -> tuple[object, ...]:
+def plain(model: Model) -> tuple[object, ...]:
     """Return what a topology is made of and how it moves."""
-    groups = [(group.name, group.count) for group in system.groups]
-    found = apc.analyze(system)
+    groups = [(group.name, group.count) for group in model.groups]
+    found = apc.analyze(model)
     modes = [(one.eigenvalue, one.multiplicity, one.family) for one in found.modes]
-    return groups, apc.parameters(system).rows, found.peers, found.spectral_radius, modes
+    return groups, apc.parameters(model).rows, found.peers, found.spectral_radius, modes
 
 
 @pytest.mark.few(4)

@@ -68,25 +68,25 @@ def topology(text: str) -> Model:
     return apc.compile(path if path.exists() else HARD / f"{text}.yaml")
 
 
-def stable_at(system: Model, found: Critical | Margin, value: Fraction) -> bool | None:
+def stable_at(model: Model, found: Critical | Margin, value: Fraction) -> bool | None:
     """Return the verdict of an analysis with the number that was searched at a value."""
     unit = "" if found.unit == "1" else f" {found.unit}"
-    return apc.analyze(system, params={found.parameter: f"{value}{unit}"}).stable
+    return apc.analyze(model, params={found.parameter: f"{value}{unit}"}).stable
 
 
-def check(system: Model, found: Critical, values: Sequence[Fraction] = ()) -> None:
+def check(model: Model, found: Critical, values: Sequence[Fraction] = ()) -> None:
     """Assert that analyses on both sides of every crossing, and at more values, say what the search says."""
     for one in found.crossings:
         # Bounds of an analysis may be wider than a crossing's own, that is proved with more digits.
         aside = 2 * Fraction(one.error) + Fraction(max(abs(one.value), 1e-3)) / 10**9
-        sides = [stable_at(system, found, Fraction(one.value) + side * aside) for side in (-1, 1)]
+        sides = [stable_at(model, found, Fraction(one.value) + side * aside) for side in (-1, 1)]
         assert sides == ([True, False] if one.stable_side == "below" else [False, True]), one
     edges = [Fraction(one.value) for one in found.crossings]
     first = (
         found.crossings[0].stable_side == "below" if edges else bool(found.verdict and found.verdict.stable)
     )
     for value in values:
-        assert stable_at(system, found, value) is (first == (sum(e < value for e in edges) % 2 == 0)), value
+        assert stable_at(model, found, value) is (first == (sum(e < value for e in edges) % 2 == 0)), value
 
 
 # ---- closed forms ----
@@ -144,27 +144,27 @@ def test_a_bump_between_two_samples_is_found_at_its_closed_form(name: str) -> No
     [("Step", 1001, 1.1), ("Kink", 1001, 3), ("Bell", 1001, 4), ("Plateau", 1002, 3), ("Angle", 1002, 4)],
 )
 def test_a_narrow_window_is_found_by_a_search_about_it(shape: str, middle: float, width: float) -> None:
-    system = sprung(shape)
+    model = sprung(shape)
     about = {"lower": str(middle - 2 * width), "upper": str(middle + 2 * width)}
-    found = apc.critical(system, "dial", **about)
+    found = apc.critical(model, "dial", **about)
     assert [one.stable_side for one in found.crossings] == ["below", "above"]
     assert all(abs(one.value - middle) < width for one in found.crossings)
     inside = Fraction(sum(one.value for one in found.crossings) / 2)
-    assert [stable_at(system, found, value) for value in (Fraction(700), inside, Fraction(1500))] == [
+    assert [stable_at(model, found, value) for value in (Fraction(700), inside, Fraction(1500))] == [
         *(True, False, True)
     ]
 
 
 @pytest.mark.whole
 def test_a_delay_that_stands_in_a_force_moves_the_force_as_well() -> None:
-    system = sprung("Straight", "low: 100 N/m, high: 1 N/m, u: 0, rate: 1e6 N/m/s")
-    found = apc.critical(system, "c.delay")
+    model = sprung("Straight", "low: 100 N/m, high: 1 N/m, u: 0, rate: 1e6 N/m/s")
+    found = apc.critical(model, "c.delay")
     assert len(found.crossings) == 1
-    check(system, found)
+    check(model, found)
 
 
 @pytest.mark.parametrize(
-    ("system", "name", "value", "off"),
+    ("model", "name", "value", "off"),
     [
         # (N − 1) times less each is the average's limit.
         (
@@ -191,9 +191,9 @@ def test_a_delay_that_stands_in_a_force_moves_the_force_as_well() -> None:
     ids=["an expression", "a start value", "a half width"],
 )
 def test_what_a_number_reaches_by_other_ways_has_its_known_value(
-    system: Model, name: str, value: float, off: float
+    model: Model, name: str, value: float, off: float
 ) -> None:
-    found = apc.critical(system, name, upper="40 mm" if "width" in name else None)
+    found = apc.critical(model, name, upper="40 mm" if "width" in name else None)
     (one,) = found.crossings
     assert one.value == pytest.approx(value, abs=off) and found.has_effect
     if name != "kt":
@@ -280,11 +280,11 @@ ALONG = {
 @pytest.mark.parametrize("name", ALONG)
 def test_the_verdict_along_a_scan_is_what_analyses_say(name: str) -> None:
     text, parameter, requested, values, count = ALONG[name]
-    system = topology(text)
-    found = apc.critical(system, parameter, **requested)
+    model = topology(text)
+    found = apc.critical(model, parameter, **requested)
     assert found.crossings and (not count or len(found.crossings) == count)
     assert found.value in [one.value for one in found.crossings]
-    check(apc.set_parameters(system, requested.get("params", {})), found, values)
+    check(apc.set_parameters(model, requested.get("params", {})), found, values)
 
 
 def test_how_many_users_is_answered_as_each_topology_alone_would() -> None:
@@ -307,16 +307,16 @@ OTHERS = sorted({*TOPOLOGIES.glob("*.yaml"), *HARD.glob("*.yaml")} - {*FIRST})
 )
 def test_every_crossing_that_is_answered_is_one_between_two_analyses(path: Path) -> None:
     """Of the first and last delay and the first stiffness: other verdicts on its sides, none of them open."""
-    system = apc.compile(path)
-    names = [one.name for one in apc.parameters(system).rows]
+    model = apc.compile(path)
+    names = [one.name for one in apc.parameters(model).rows]
     stiff, late = ([one for one in names if one.endswith(end)] for end in ("stiffness", ".delay"))
     for name in dict.fromkeys([*late[:1], *late[-1:], *stiff[:1]]):
         try:
-            found = apc.critical(system, name, criterion="nominal")
+            found = apc.critical(model, name, criterion="nominal")
         except ApcError as error:
             assert error.mistakes[0].code in ("E804", "E805", "E844", "E845", "E846"), error
             continue
-        check(system, found)
+        check(model, found)
 
 
 @pytest.mark.parametrize("seed", [3, pytest.param(4, marks=pytest.mark.whole)])
@@ -344,14 +344,14 @@ def test_a_link_delay_jumps_where_a_packet_comes_a_tick_later() -> None:
 @pytest.mark.parametrize(("name", "value"), [("device.x", -0.02), ("contact.half_width", 0.01)])
 def test_where_a_contact_closes_the_radius_jumps_at_the_geometry(name: str, value: float) -> None:
     """The device at x = −10 mm touches a cube at 0 within its half width: open at equality, where f = 0."""
-    system = compiled(replaced(PRESSED, ("1000 N/m", "200 kN/m")))
-    found = apc.critical(system, name, lower="-0.05 m" if value < 0 else None, upper="0.05 m")
+    model = compiled(replaced(PRESSED, ("1000 N/m", "200 kN/m")))
+    found = apc.critical(model, name, lower="-0.05 m" if value < 0 else None, upper="0.05 m")
     (one,) = found.crossings
     assert (one.kind, one.value, one.stable_side) == ("jump", value, "below")
     for off, stable in ((-1e-9, True), (1e-9, False)):
-        moved = apc.set_parameters(system, {name: value + off})
+        moved = apc.set_parameters(model, {name: value + off})
         assert apc.analyze(moved).stable is stable
-    at = apc.analyze(apc.set_parameters(system, {name: value})).stable
+    at = apc.analyze(apc.set_parameters(model, {name: value})).stable
     assert one.stable_at is at
 
 
@@ -365,9 +365,9 @@ def test_jumps_of_a_topology_within_a_part_in_10_13_of_its_boundary_are_exact() 
 @pytest.mark.parametrize("low", [0, 14])
 def test_where_a_search_of_delays_begins_is_looked_at_by_itself(low: int) -> None:
     """A packet due at a tick is heard at it, and one a microsecond later at the next."""
-    system = apc.set_parameters(topology("star-lecture"), {STIFFNESS: "873.3965451925634 N/m"})
-    found = apc.critical(system, "lecture.delay", lower=f"{low} ms", upper="18 ms")
-    at, above = (stable_at(system, found, Fraction(low, 1000) + more) for more in (0, Fraction(1, 10**6)))
+    model = apc.set_parameters(topology("star-lecture"), {STIFFNESS: "873.3965451925634 N/m"})
+    found = apc.critical(model, "lecture.delay", lower=f"{low} ms", upper="18 ms")
+    at, above = (stable_at(model, found, Fraction(low, 1000) + more) for more in (0, Fraction(1, 10**6)))
     assert at is not above
     first = found.crossings[0]
     assert (first.value, first.error, first.stable_side) == (low / 1000, 0.0, "below" if at else "above")
@@ -487,11 +487,11 @@ links: {wan: {clock: network, delay: 40 ms}}
 @pytest.mark.few(1)
 @pytest.mark.parametrize("damping", ["", "damping: 2 N*s/m,"])
 def test_a_long_delay_is_decided_as_an_analysis_decides_it(damping: str) -> None:
-    system = compiled(PAIR.replace("DAMPING", damping))
-    found = apc.critical(system, "pd.stiffness")
+    model = compiled(PAIR.replace("DAMPING", damping))
+    found = apc.critical(model, "pd.stiffness")
     (one,) = found.crossings
     assert one.error < 1e-6 * one.value
-    check(system, found)
+    check(model, found)
     if not damping:
         # By another program, which lifts the frame and takes eigenvalues in NumPy.
         assert one.value == pytest.approx(858.30610337740, rel=1e-11)

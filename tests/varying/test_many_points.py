@@ -20,10 +20,10 @@ from tests.paper_limit import BITS, truth
 from tests.topologies import AVERAGE, MESH, OSCILLATOR, ROOT, TOPOLOGIES, compiled, messages_of, replaced
 
 
-def as_alone(system: Model, given: Mapping[str, Any], points: Any = None) -> Analyses:
+def as_alone(model: Model, given: Mapping[str, Any], points: Any = None) -> Analyses:
     """Analyse points and assert that each, or each of some, is as its own analysis says."""
-    found = apc.analyze_many(system, given)
-    rows = apc.parameters(system).rows
+    found = apc.analyze_many(model, given)
+    rows = apc.parameters(model).rows
     units = {
         name: next(one.unit for one in rows if one.name.endswith(name) or name.endswith(one.name))
         for name in given
@@ -36,7 +36,7 @@ def as_alone(system: Model, given: Mapping[str, Any], points: Any = None) -> Ana
         for name, values in zip(given, listed, strict=True):
             settings[name] = f"{float(values[point])!r} {units[name]}".removesuffix(" 1")
         try:
-            one = apc.analyze(system, params=settings)
+            one = apc.analyze(model, params=settings)
         except ApcError as error:
             assert found.verdict.ravel()[point] == f"error: {error.mistakes[0].code}"
             assert found.message.ravel()[point] == error.mistakes[0].sentence
@@ -66,15 +66,15 @@ EVERY_TOPOLOGY = sorted(
 @pytest.mark.parametrize("points", [2, 6])
 @pytest.mark.parametrize("path", EVERY_TOPOLOGY, ids=lambda path: path.stem)
 def test_every_point_is_as_an_analysis_of_its_own_says(path: Path, points: int) -> None:
-    system = apc.compile(path)
-    rows = apc.parameters(system).rows
+    model = apc.compile(path)
+    rows = apc.parameters(model).rows
     free = [one for one in rows if one.low == one.high and not (one.follows or one.fixed) and one.unit != "s"]
     free = [one for one in free if not one.name.endswith((".x", ".v", ".count", "loss", ".start"))][:3]
     random = np.random.default_rng(len(path.stem))
     drawn = {one.name: (one.low or 1.0) * random.uniform(0.5, 1.7, points) for one in free}
     for one in free:
         drawn[one.name][0] = one.low
-    as_alone(system, drawn)
+    as_alone(model, drawn)
 
 
 @pytest.mark.parametrize("damping", [0.0, pytest.param(2.0, marks=pytest.mark.whole)])
@@ -117,9 +117,9 @@ def test_whole_turns_in_a_frame_are_counted() -> None:
 
 def test_what_enters_as_a_ratio_alone_is_moved_all_the_same() -> None:
     """Without clocks A has k/m and d/m and nothing else: moved all alike, these stay."""
-    system = compiled(replaced(OSCILLATOR.format(stiffness=50, damping=4), ("1 kg", "2 kg")))
+    model = compiled(replaced(OSCILLATOR.format(stiffness=50, damping=4), ("1 kg", "2 kg")))
     mass, stiffness = np.array([2.0, 4.0, 3.0]), np.array([50.0, 70.0, 90.0])
-    found = apc.analyze_many(system, {"device.mass": mass, "s.stiffness": stiffness, "s.damping": mass * 2})
+    found = apc.analyze_many(model, {"device.mass": mass, "s.stiffness": stiffness, "s.damping": mass * 2})
     assert found.spectral_radius == pytest.approx([math.exp(-1)] * 3, rel=1e-12)  # e^{−d/(2m)}
     assert found.frequency_hz == pytest.approx(np.sqrt(stiffness / mass - 1) / (2 * math.pi), rel=1e-10)
 

@@ -54,16 +54,16 @@ def hasty(delay: str, stiffness: str = "60 N/m") -> str:
     )
 
 
-def rows_of(system: Model) -> dict[str, Margin]:
-    return {one.parameter: one for one in apc.margins(system).rows}
+def rows_of(model: Model) -> dict[str, Margin]:
+    return {one.parameter: one for one in apc.margins(model).rows}
 
 
-def holds(system: Model, one: Margin) -> None:
+def holds(model: Model, one: Margin) -> None:
     """Assert that analyses decide otherwise on both sides of a margin."""
     assert one.value is not None and one.error is not None
     assert one.value > one.current and one.error <= 1e-6 * one.value
     aside = max(2 * one.error, 1e-8 * one.value)
-    assert [stable_at(system, one, Fraction(one.value + side * aside)) for side in (-1, 1)] == [True, False]
+    assert [stable_at(model, one, Fraction(one.value + side * aside)) for side in (-1, 1)] == [True, False]
     assert one.gain_margin == (one.value / one.current if one.current else None)
 
 
@@ -97,20 +97,20 @@ def test_every_stiffness_damping_and_delay_of_a_coupler_has_a_row() -> None:
     ids=["average", "pressed", "dead reckoning", "12 ms", "30 ms", "50 ms", "different"],
 )
 def test_a_margin_lies_between_two_analyses(topology: str, names: Sequence[str]) -> None:
-    system = compiled(topology) if "\n" in topology else apc.compile(HARD / f"{topology}.yaml")
-    rows = rows_of(system)
+    model = compiled(topology) if "\n" in topology else apc.compile(HARD / f"{topology}.yaml")
+    rows = rows_of(model)
     for name in names:
         assert not rows[name].note
-        holds(system, rows[name])
+        holds(model, rows[name])
 
 
 @pytest.mark.whole
 def test_a_delay_without_a_margin_is_stable_as_far_as_it_was_scanned() -> None:
-    system = compiled(DEAD_RECKONING)
-    row = rows_of(system)["coordination.delay"]
+    model = compiled(DEAD_RECKONING)
+    row = rows_of(model)["coordination.delay"]
     assert row.value is None
     for share in (0.3, 0.6, 0.9):
-        assert apc.analyze(system, params={row.parameter: f"{share * row.searched_to} s"}).stable
+        assert apc.analyze(model, params={row.parameter: f"{share * row.searched_to} s"}).stable
 
 
 def test_a_topology_that_is_not_stable_has_no_margins_and_says_so() -> None:
@@ -224,7 +224,7 @@ def test_at_a_degenerate_kink_no_margin_is_lost(
         "  spring: {type: SpringDamper, a: device, b: ground, stiffness: 100 N/m}\n"
         "  slow: {type: SpringDamper, a: other, b: ground, stiffness: 1 N/m}\n"
     )
-    system = compiled(text, library(tmp_path, part.replace("parameters:\n", numbers)))
-    rows = {row.parameter: row for row in apc.margins(system).rows}
+    model = compiled(text, library(tmp_path, part.replace("parameters:\n", numbers)))
+    rows = {row.parameter: row for row in apc.margins(model).rows}
     assert {"own.K", "own.Q", "spring.stiffness", "slow.stiffness"} <= set(rows)
     assert rows["own.K"].searched_to >= 1e5 or rows["own.K"].value is not None

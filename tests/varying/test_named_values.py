@@ -35,8 +35,8 @@ def path(tmp_path: Path) -> str:
 
 def verdict(value: str) -> tuple[str, float]:
     model = compiled(TEXT)
-    system = apply(model, [parse_override(model, f"wall.side={value}")])
-    result = apc.analyze(system)
+    compiled_model = apply(model, [parse_override(model, f"wall.side={value}")])
+    result = apc.analyze(compiled_model)
     return result.verdict, result.spectral_radius
 
 

@@ -38,11 +38,11 @@ def topology(place: int) -> Model:
 
 def answers(place: int) -> str:
     """Return everything that is told of a topology, every digit of it."""
-    system = topology(place)
-    listed = [repr(apc.analyze(system)), repr(apc.event_order(system))]
+    model = topology(place)
+    listed = [repr(apc.analyze(model)), repr(apc.event_order(model))]
     if place in DEEP:
-        many = apc.analyze_many(system, {"contact.stiffness": [300.0, 700.0, 1500.0]})
-        listed += [repr(many.to_dict()), repr(apc.margins(system)), repr(apc.sensitivities(system))]
+        many = apc.analyze_many(model, {"contact.stiffness": [300.0, 700.0, 1500.0]})
+        listed += [repr(many.to_dict()), repr(apc.margins(model)), repr(apc.sensitivities(model))]
     return "\n".join(listed)
 
 

@@ -87,7 +87,7 @@ def test_a_wall_carries_the_force_beyond_its_surface() -> None:
 @pytest.mark.parametrize("distance", [0.001, 0.01, 0.4])
 def test_a_free_body_is_pushed_to_a_wall_at_any_distance(distance: float, stiffness: float) -> None:
     """At rest the wall carries the force: x = d + F/k, from a start in free space."""
-    system = compiled(AWAY)
+    model = compiled(AWAY)
     for force, mass in ((0.5, 0.05), (3.0, 1.0), (20.0, 0.2)):
         values = {
             "wall.position": distance,
@@ -95,13 +95,13 @@ def test_a_free_body_is_pushed_to_a_wall_at_any_distance(distance: float, stiffn
             "push.force": force,
             "device.mass": mass,
         }
-        found = positions(apc.operating_point(apc.set_parameters(system, values)))["device.x"]
+        found = positions(apc.operating_point(apc.set_parameters(model, values)))["device.x"]
         assert found == pytest.approx(distance + force / stiffness, rel=1e-9)
 
 
 def test_a_contact_that_is_pulled_open_is_off() -> None:
-    system = compiled(WALL.format(force=-2).replace("5 N*s/m}", "5 N*s/m, x: 10 mm}"))
-    point = apc.operating_point(system)
+    model = compiled(WALL.format(force=-2).replace("5 N*s/m}", "5 N*s/m, x: 10 mm}"))
+    point = apc.operating_point(model)
     assert positions(point) == {"device.x": pytest.approx(-2 / 250, rel=1e-14)}
     assert dict(point.active) == {"wall.push": False}
 
@@ -117,10 +117,10 @@ def test_a_nonlinear_spring_rests_at_the_root_of_an_independent_solver() -> None
 
 
 def test_a_long_damped_simulation_ends_at_the_equilibrium() -> None:
-    system = compiled(replaced(PRESSED, ("5 N*s/m", "30 N*s/m")))
-    end = apc.simulate(system, duration="4 s")["user[1].device.x"][-1]
-    assert positions(apc.operating_point(system))["device.x"] == pytest.approx(end, rel=1e-9)
-    started = apc.operating_point(system, initial="simulation", duration="0.5 s")
+    model = compiled(replaced(PRESSED, ("5 N*s/m", "30 N*s/m")))
+    end = apc.simulate(model, duration="4 s")["user[1].device.x"][-1]
+    assert positions(apc.operating_point(model))["device.x"] == pytest.approx(end, rel=1e-9)
+    started = apc.operating_point(model, initial="simulation", duration="0.5 s")
     assert started.initial == "simulation"
     assert positions(started)["device.x"] == pytest.approx(end, rel=1e-9)
 
@@ -187,14 +187,14 @@ masses: {device: {mass: 0.1 kg, damping: 5 N*s/m, x: 1 mm}}
 couplers: {spring: {type: Progressive, flange: device, stiffness: 800 N/m, length: 0.1 m, clock: haptic}}
 hands: {push: {type: ConstantForce, flange: device, force: 3 N}}
 """
-    system = compiled(text, library(tmp_path, part))
+    model = compiled(text, library(tmp_path, part))
     x = np.sqrt(3 * 0.1 / 800)
-    assert positions(apc.operating_point(system))["device.x"] == pytest.approx(x, rel=1e-13)
+    assert positions(apc.operating_point(model))["device.x"] == pytest.approx(x, rel=1e-13)
     rates = np.array([[0, 1, 0], [-800 * x / 0.1 / 0.1, -50, -800 * x / 0.1], [0, 0, 0]])
     step = expm(0.001 * rates)
     frame = step[:2, :2] + step[:2, 2:] @ np.array([[1 / 0.1, 0]])
     radius = np.abs(np.linalg.eigvals(frame)).max()
-    assert apc.analyze(system, operating_point="equilibrium").spectral_radius == pytest.approx(
+    assert apc.analyze(model, operating_point="equilibrium").spectral_radius == pytest.approx(
         radius, rel=1e-12
     )
 
@@ -212,11 +212,11 @@ equations: [f + soft*f^3 = stiffness*flange.x, flange.f = f]
     spring = "  soft: {type: SoftSpring, flange: device, stiffness: 500 N/m, soft: 1 1/N^2}\n"
     text = WALL.format(force=2).replace("stiffness: 100 N/m", "stiffness: 0 N/m")
     text = text.replace("150 N/m", "0 N/m").replace("hands:", f"{spring}hands:").replace("4 mm", "1 m")
-    system = compiled(text, library(tmp_path, part))
-    assert positions(apc.operating_point(system))["device.x"] == pytest.approx((2 + 2**3) / 500, rel=1e-12)
+    model = compiled(text, library(tmp_path, part))
+    assert positions(apc.operating_point(model))["device.x"] == pytest.approx((2 + 2**3) / 500, rel=1e-12)
     linear = compiled(WALL.format(force=2).replace("4 mm", "1 m").replace("150 N/m", "0 N/m"))
     local = apc.analyze(linear, params={"first.stiffness": 500 / 13}).spectral_radius
-    found = apc.analyze(system, operating_point="equilibrium").spectral_radius
+    found = apc.analyze(model, operating_point="equilibrium").spectral_radius
     assert found == pytest.approx(local, rel=1e-12)
 
 
@@ -247,10 +247,10 @@ def test_the_equilibrium_is_found_again_at_every_value_of_a_parameter() -> None:
     """The local stiffness 1.5 K^(2/3) F^(1/3) has the critical value of a linear spring."""
     limit = apc.critical(compiled(SPRING), "contact.stiffness").value
     assert limit is not None
-    system, critical_stiffness = compiled(PRESSED), (limit / 1.5) ** 1.5 / 3**0.5
-    found = apc.critical(system, "contact.stiffness", operating_point="equilibrium")
+    model, critical_stiffness = compiled(PRESSED), (limit / 1.5) ** 1.5 / 3**0.5
+    found = apc.critical(model, "contact.stiffness", operating_point="equilibrium")
     assert found.value == pytest.approx(critical_stiffness, rel=1e-6)
-    force = apc.critical(system, "push.force", lower=-200.0, upper=-1.0, operating_point="equilibrium").value
+    force = apc.critical(model, "push.force", lower=-200.0, upper=-1.0, operating_point="equilibrium").value
     assert force == pytest.approx(-((limit / 1.5) ** 3) / 20000**2, rel=1e-6)
 
 
@@ -282,8 +282,8 @@ def test_delays_are_varied_at_one_equilibrium() -> None:
 
 
 def test_transparency_at_the_equilibrium_has_the_local_stiffness() -> None:
-    system = compiled(PRESSED)
-    felt = apc.transparency(system, [1.0], operating_point="equilibrium")
+    model = compiled(PRESSED)
+    felt = apc.transparency(model, [1.0], operating_point="equilibrium")
     linear = apc.transparency(compiled(SPRING), [1.0], params={"contact.stiffness": hertz()})
     assert felt.impedance == pytest.approx(linear.impedance, rel=1e-9)
     assert "linearized at the equilibrium" in " ".join(str(felt).split())
@@ -315,9 +315,9 @@ def test_sensitivities_contain_the_motion_of_the_equilibrium(cli: Cli, tmp_path:
 
 
 def test_without_forces_the_equilibrium_is_the_start() -> None:
-    system = compiled(AVERAGE)
-    assert set(positions(apc.operating_point(system)).values()) == {0.0}
-    started, resting = (apc.analyze(system, operating_point=point) for point in ("start", "equilibrium"))
+    model = compiled(AVERAGE)
+    assert set(positions(apc.operating_point(model)).values()) == {0.0}
+    started, resting = (apc.analyze(model, operating_point=point) for point in ("start", "equilibrium"))
     assert started.spectral_radius == resting.spectral_radius and not resting.linearized
 
 

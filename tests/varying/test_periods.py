@@ -70,8 +70,8 @@ def test_a_number_on_which_the_period_depends_has_the_same_limit(
 ) -> None:
     other = "  that: {type: Late, pull: 1 Hz, growth: 0 Hz, clock: other, delay: 0 ms}\n" * beside
     parameters = "parameters: {" + declared.strip("{}") + "}\n"
-    system = pulled(0, ", other: 3 ms" * beside, other + parameters, tick=tick)
-    found = apc.critical(system, declared.strip("{")[0])
+    model = pulled(0, ", other: 3 ms" * beside, other + parameters, tick=tick)
+    found = apc.critical(model, declared.strip("{")[0])
     (one,) = found.crossings
     assert abs(one.value - limit) <= one.error <= (2e-3 if beside else 1e-11) * limit
     assert one.stable_side == ("above" if tick == "1/f" else "below")
@@ -79,8 +79,8 @@ def test_a_number_on_which_the_period_depends_has_the_same_limit(
 
 @pytest.mark.parametrize("period", ["1 ms", "3 ms"])
 def test_beside_another_clock_the_error_is_the_gap_between_periods(period: str) -> None:
-    system = alongside(period)
-    found = apc.critical(system, "tick.period")
+    model = alongside(period)
+    found = apc.critical(model, "tick.period")
     (one,) = found.crossings
     assert abs(one.value - 2 / PULL) <= one.error < 1e-3 * one.value and one.kind == "period"
     # The ends are fractions of the other period with short frames.
@@ -88,7 +88,7 @@ def test_beside_another_clock_the_error_is_the_gap_between_periods(period: str) 
     for side, stable in ((-1, True), (1, False)):
         end = Fraction((one.value + side * one.error) / float(unit)).limit_denominator(400) * unit
         assert (
-            analyze(numeric_model(system_with_delay(system, ParameterRef("tick.period"), end))).stable
+            analyze(numeric_model(system_with_delay(model, ParameterRef("tick.period"), end))).stable
             is stable
         )
 
@@ -100,11 +100,11 @@ def test_the_textbook_wall_with_passive_hands_has_its_longest_period() -> None:
 
 
 def test_periods_of_too_long_frames_are_refused_by_name() -> None:
-    system = alongside("1 ms")
+    model = alongside("1 ms")
     with pytest.raises(
         apc.ApcError, match=r"E844 values of tick\.period from .* lead to frames of more than"
     ):
-        apc.critical(system, "tick.period", lower="2.00011 ms", upper="2.00012 ms")
+        apc.critical(model, "tick.period", lower="2.00011 ms", upper="2.00012 ms")
 
 
 @pytest.mark.whole
@@ -112,8 +112,8 @@ def test_a_region_over_a_period_is_that_of_the_closed_form() -> None:
     # Stable where pull·T < 2: of pull 50 to 200 Hz and T 5 to 25 ms.
     # ∫ min(2/p, 25 ms) − 5 ms dp = 30·20 ms + ∫_80^200 (2/p − 5 ms) dp.
     truth = 30 * 0.02 + 2 * math.log(200 / 80) - 120 * 0.005
-    for system, most in ((pulled(0), 1e-6), (alongside("1 ms"), 0.03)):
-        found = apc.region(system, x="tick.period=5 ms:25 ms", y="it.pull=50 Hz:200 Hz")
+    for model, most in ((pulled(0), 1e-6), (alongside("1 ms"), 0.03)):
+        found = apc.region(model, x="tick.period=5 ms:25 ms", y="it.pull=50 Hz:200 Hz")
         assert abs(found.stable_area - truth) <= most * truth
 
 
@@ -166,5 +166,5 @@ def test_a_period_follows_a_rate_that_it_names() -> None:
     periods = {timing.name: timing.value for timing in changed.timings}
     assert periods["haptic.period"] == Fraction(1, 500)
     direct = apply(model, [parse_override(model, "haptic.period=2 ms")])
-    radius = [analyze(numeric_model(system)).spectral_radius for system in (changed, direct)]
+    radius = [analyze(numeric_model(compiled_model)).spectral_radius for compiled_model in (changed, direct)]
     assert radius[0] == radius[1]

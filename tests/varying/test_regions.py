@@ -47,10 +47,10 @@ def random_points(found: Region, count: int, seed: int = 7) -> list[list[float]]
     return (low + width * np.random.default_rng(seed).uniform(0, 1, (count, 2))).tolist()
 
 
-def stable(system: Model, found: Region, x: float, y: float) -> bool | None:
+def stable(model: Model, found: Region, x: float, y: float) -> bool | None:
     values = zip((found.x, found.y), (x, y), strict=True)
     settings = {axis.free.label: f"{value!r} {axis.unit}".removesuffix(" 1") for axis, value in values}
-    return apc.analyze(system, params=settings).stable
+    return apc.analyze(model, params=settings).stable
 
 
 def true_error(found: Region, every: int) -> float:
@@ -254,8 +254,8 @@ PLANES = {
 @cache
 def plane(name: str) -> tuple[Model, Region]:
     text, x, y, settings = PLANES[name]
-    system = apc.set_parameters(compiled(text) if "\n" in text else topology(text), settings)
-    return system, apc.region(system, x=x, y=y)
+    model = apc.set_parameters(compiled(text) if "\n" in text else topology(text), settings)
+    return model, apc.region(model, x=x, y=y)
 
 
 @pytest.mark.few(4)
@@ -264,10 +264,10 @@ def plane(name: str) -> tuple[Model, Region]:
     [pytest.param(one, marks=[pytest.mark.whole] if one.startswith("begins") else []) for one in PLANES],
 )
 def test_what_is_inside_is_what_an_analysis_calls_stable_and_curves_are_as_near_as_is_said(name: str) -> None:
-    system, found = plane(name)
+    model, found = plane(name)
     assert found.curves
     for a, b in random_points(found, 10):
-        assert found.contains(a, b) == stable(system, found, a, b)
+        assert found.contains(a, b) == stable(model, found, a, b)
     coarse = name == "looks at each sender"
     assert bool(found.coarse) == coarse == bool(found.to_dict()["coarse"])
     assert ("above the requested 1e-09" in str(found)) == coarse
@@ -283,7 +283,7 @@ def test_what_is_inside_is_what_an_analysis_calls_stable_and_curves_are_as_near_
             for side in (1, -1):
                 a, b = (curve.points[k] + side * 1e-5 * normal[k] * width).tolist()
                 if np.all(np.abs(np.array([a, b]) - found.rectangle.low - width / 2) < width / 2):
-                    assert stable(system, found, a, b) is (side > 0)
+                    assert stable(model, found, a, b) is (side > 0)
 
 
 @pytest.mark.whole

@@ -83,17 +83,17 @@ def test_where_the_groups_differ_each_has_a_derivative_of_its_own() -> None:
         assert found[name] == pytest.approx(other[name], rel=1e-9)
 
 
-def changed(system: Model, every: int) -> str:
+def changed(model: Model, every: int) -> str:
     """Set the number of every so many rows 1 ‰ off, as `--set` does; compare the radius with its row."""
-    found = apc.sensitivities(system)
-    radius = apc.analyze(system).spectral_radius
+    found = apc.sensitivities(model)
+    radius = apc.analyze(model).spectral_radius
     for name in [*dict.fromkeys(row.parameter for row in found.rows)][::every]:
         rows = [row for row in found.rows if row.parameter == name]
         if not rows[0].value:
             continue
         unit = "" if rows[0].unit == "1" else f" {rows[0].unit}"
         low, high = (
-            apc.analyze(system, params={name: f"{rows[0].value * (1 + side)!r}{unit}"}).spectral_radius
+            apc.analyze(model, params={name: f"{rows[0].value * (1 + side)!r}{unit}"}).spectral_radius
             for side in (-1e-3, 1e-3)
         )
         up, down, printed = (high - radius) / 1e-3, (radius - low) / 1e-3, [row.relative for row in rows]
@@ -115,8 +115,8 @@ def test_a_row_says_what_setting_its_name_does(name: str, every: int) -> None:
 
 def test_where_the_radius_is_large_it_is_differentiated_all_the_same() -> None:
     """A full mesh of 1,000: radius 6e7, of which a distance of 1e-10 is no float."""
-    system = compiled(replaced(MESH, ("count: 3", "count: 1000")))
-    assert apc.sensitivities(system).radius > 1e7 and changed(system, 2) == ""
+    model = compiled(replaced(MESH, ("count: 3", "count: 1000")))
+    assert apc.sensitivities(model).radius > 1e7 and changed(model, 2) == ""
 
 
 @pytest.mark.whole
@@ -196,18 +196,18 @@ masses:
 couplers:
   p: {type: Integrator, a: device, kp: 100 N/m, ki: 0 N/m, leak: 1, clock: haptic}
 """
-    system = compiled(text, library(tmp_path, part))
-    found = apc.sensitivities(system)
+    model = compiled(text, library(tmp_path, part))
+    found = apc.sensitivities(model)
     assert found.note == "the excluded modes depend on p.ki, p.leak, so their sensitivities are not computed"
     assert rates(found).keys() == {"device.mass", "device.damping", "p.kp"}
-    assert check_sensitivities(system, found) == ""
-    analysis = apc.analyze(system)
+    assert check_sensitivities(model, found) == ""
+    analysis = apc.analyze(model)
     assert (analysis.verdict, analysis.rigid_modes, analysis.translations) == ("stable", 1, 0)
     assert analysis.unobservable == ("p.s",) and "Nothing ties" not in str(analysis)
     # Without the spring the device translates, and the integrator adds up where to: no drift.
-    loose = apc.analyze(system, params={"p.kp": "0 N/m"})
+    loose = apc.analyze(model, params={"p.kp": "0 N/m"})
     assert (loose.verdict, loose.stable, loose.translations) == ("stable up to a common translation", True, 1)
-    used = apc.analyze(system, params={"p.ki": "1 N/m"})
+    used = apc.analyze(model, params={"p.ki": "1 N/m"})
     assert (used.rigid_modes, used.unobservable) == (0, ())
 
 

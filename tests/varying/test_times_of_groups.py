@@ -63,19 +63,19 @@ def test_set_without_a_group_is_one_value_for_all_groups(text: str, delay: str) 
 
 
 def test_analyze_and_critical_have_the_values_of_a_simulation_of_their_own() -> None:
-    system = compiled(TWO)
-    assert apc.analyze(system, params={NAME: "20 ms"}).spectral_radius == pytest.approx(RADIUS, rel=1e-12)
-    assert apc.critical(system, NAME).value == pytest.approx(LIMIT, rel=1e-6)
+    model = compiled(TWO)
+    assert apc.analyze(model, params={NAME: "20 ms"}).spectral_radius == pytest.approx(RADIUS, rel=1e-12)
+    assert apc.critical(model, NAME).value == pytest.approx(LIMIT, rel=1e-6)
     assert apc.critical(compiled(EVERY), NAME).value == pytest.approx(LIMIT, rel=1e-6)
 
 
 def test_a_group_that_is_set_too_has_its_own_value_in_any_order() -> None:
-    system = compiled(TWO)
+    model = compiled(TWO)
     pairs = [(NAME, "20 ms"), ("b.coordination.delay", "3 ms")]
     text = replaced(TWO, ("delay: 0 ms", "delay: 20 ms"), ("delay: 1 ms", "delay: 3 ms"))
     truth = apc.analyze(compiled(text)).spectral_radius
     for some in itertools.permutations(pairs):
-        assert apc.analyze(system, params=dict(some)).spectral_radius == pytest.approx(truth, rel=1e-12)
+        assert apc.analyze(model, params=dict(some)).spectral_radius == pytest.approx(truth, rel=1e-12)
 
 
 def test_the_commands_that_set_vary_or_play_a_delay_agree(
@@ -129,18 +129,16 @@ def test_a_box_and_tuned_gains_are_those_of_the_delay_that_is_set(
 
 def test_the_delay_of_a_pair_is_a_number_of_its_own_in_every_command(tmp_path: Path) -> None:
     text = replaced(TWO, ("delay: 2 ms}", "delay: 2 ms, delays: {a: {b: 4 ms}}}"))
-    system = compiled(text)
+    model = compiled(text)
     there = compiled(replaced(text, ("delay: 2 ms, delays", "delay: 8 ms, delays")))
     truth = apc.analyze(there).spectral_radius
-    assert apc.analyze(system, params={"lan.delay": "8 ms"}).spectral_radius == pytest.approx(
-        truth, rel=1e-12
-    )
+    assert apc.analyze(model, params={"lan.delay": "8 ms"}).spectral_radius == pytest.approx(truth, rel=1e-12)
     for name, value in (("lan.delay", "8 ms"), ("lan.delays.a.b", "4 ms")):
         path = tmp_path / f"{name}.csv"
         apc.sweep(there, {name: [value, "40 ms"]}, out=path)
         radius = float(path.read_text().splitlines()[1].split(",")[2])
         assert radius == pytest.approx(truth, rel=1e-12), name
-    assert apc.critical(system, "lan.delays.a.b", params={"lan.delay": "8 ms"}).value == pytest.approx(
+    assert apc.critical(model, "lan.delays.a.b", params={"lan.delay": "8 ms"}).value == pytest.approx(
         apc.critical(there, "lan.delays.a.b").value, rel=1e-9
     )
 

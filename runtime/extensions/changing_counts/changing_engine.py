@@ -59,7 +59,7 @@ class PresentPeers:
 
     def indices(self, group: int, peers: Flags) -> Integers:
         """Return the indices of some peers (N,) among the present peers of a group."""
-        first = np.cumsum([0, *(model_group.count for model_group in self.simulation.system.groups)])
+        first = np.cumsum([0, *(model_group.count for model_group in self.simulation.model.groups)])
         chosen = peers[self.present][first[group] : first[group + 1]]
         return np.flatnonzero(chosen)
 
@@ -170,7 +170,7 @@ class ChangingEngine:
     def _prepare(self, present: Flags) -> PresentPeers:
         """Return the present peers with their simulation, and a new engine."""
         simulation, starts = self._simulation(present), self.presence.first_peers
-        peers, counts = np.flatnonzero(present), [group.count for group in simulation.system.groups]
+        peers, counts = np.flatnonzero(present), [group.count for group in simulation.model.groups]
         first = dict(zip(starts, np.cumsum([0, *counts]).tolist(), strict=False))
         pairs = [
             (source, self.column_of[key])

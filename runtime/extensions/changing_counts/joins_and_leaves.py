@@ -180,12 +180,12 @@ def changing_counts(numeric: NumericModel, text: str, *, lossy: bool = False) ->
     )
 
 
-def _parts_at_start(system: Model) -> tuple[str, ...]:
+def _parts_at_start(model: Model) -> tuple[str, ...]:
     """Return the parts with states or stored values that are not means at a joining peer."""
     return tuple(
         dict.fromkeys(
             name.partition(".")[0]
-            for peer_type in system.peer_types
+            for peer_type in model.peer_types
             for name in stored_names(peer_type)
             if not peer_type.joins_at_mean(name)
         )
@@ -194,23 +194,23 @@ def _parts_at_start(system: Model) -> tuple[str, ...]:
 
 def _counts(numeric: NumericModel, name: str, values: str) -> tuple[ParameterRef, tuple[int, ...]]:
     """Return the number of peers that changes, and its values in rising order."""
-    system = numeric.model
-    names = [group_count(group.name) for group in system.groups]
+    model = numeric.model
+    names = [group_count(group.name) for group in model.groups]
     fix = f'--changing "{names[0]}=2:10"'
     if not values.strip():
         got = name or "nothing"
         raise ApcError(Diagnostic("E890", LOCATION, "changing count", "NAME=LOW:HIGH", got, fix))
     try:
-        if find(system, name, LOCATION, counts=True).name not in names:
+        if find(model, name, LOCATION, counts=True).name not in names:
             expected = f"the number of peers of a group ({', '.join(names)})"
             raise ApcError(Diagnostic("E890", LOCATION, "changing count", expected, name, fix))
-        axis = parse_axis(system, name, values)
+        axis = parse_axis(model, name, values)
         if len(axis.values) > MOST_COUNTS:
             least, expected = min(axis.values), f"at most {MOST_COUNTS} counts"
             got, fewer = str(len(axis.values)), f"{axis.free.name}={least}:{least + MOST_COUNTS - 1}"
             raise ApcError(Diagnostic("E890", LOCATION, axis.free.label, expected, got, fewer))
         for count in axis.values:
-            apply(system, [Override(axis.free, count)])
+            apply(model, [Override(axis.free, count)])
     except ApcError as error:
         raise _located(error, names, values, fix) from None
     return axis.free, tuple(sorted(map(int, axis.values)))

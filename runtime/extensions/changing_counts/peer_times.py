@@ -38,12 +38,12 @@ NEVER = np.iinfo(np.int64).max  # the instant of a leave that does not happen
 _PEER = re.compile(r"(?P<group>.+?)(\[(?P<number>\d{1,9})\])?", re.ASCII)
 
 
-def with_peer_times(system: Model, joins: Sequence[str], leaves: Sequence[str]) -> Model:
+def with_peer_times(model: Model, joins: Sequence[str], leaves: Sequence[str]) -> Model:
     """Return a model whose experiment has these joins and leaves; those of the model if empty.
 
     Parameters
     ----------
-    system
+    model
         The model.
     joins, leaves
         A peer and its instant each, such as "user[4]=2 s".
@@ -59,9 +59,9 @@ def with_peer_times(system: Model, joins: Sequence[str], leaves: Sequence[str]) 
             with mistakes:
                 given[key] = (*given.get(key, ()), _peer_time(key, text))
     mistakes.raise_if_any()
-    experiment = system.experiment
+    experiment = model.experiment
     return replace(
-        system,
+        model,
         experiment=replace(
             experiment,
             joins=given.get("joins", experiment.joins),
@@ -86,12 +86,12 @@ def _peer_time(key: str, text: str) -> PeerTime:
     return PeerTime(peer.strip(), Fraction(at.value))
 
 
-def presence_of(system: Model, schedule: Schedule, duration: Fraction) -> Presence:
+def presence_of(model: Model, schedule: Schedule, duration: Fraction) -> Presence:
     """Return the peers that are present at each instant of a simulation.
 
     Parameters
     ----------
-    system
+    model
         The model, whose experiment has joins or leaves.
     schedule
         The schedule of a frame of the first group.
@@ -104,37 +104,37 @@ def presence_of(system: Model, schedule: Schedule, duration: Fraction) -> Presen
         E914 an invalid join or leave, or a model whose peers can't join and leave.
     """
     mistakes, frame_s = Mistakes(), schedule.frame_s
-    joins = np.zeros(system.peers, np.int64)
-    leaves = np.full(system.peers, NEVER)
-    first = first_peers(system)
+    joins = np.zeros(model.peers, np.int64)
+    leaves = np.full(model.peers, NEVER)
+    first = first_peers(model)
     for key, array in (("joins", joins), ("leaves", leaves)):
         given = set[int]()
-        for item in getattr(system.experiment, key):
+        for item in getattr(model.experiment, key):
             with mistakes:
-                group, number = _peer_of(system, key, item)
+                group, number = _peer_of(model, key, item)
                 peer, name = first[group.name] + number - 1, f"{group.name}[{number}]"
                 if peer in given:
-                    raise _fault(system, key, item, name, f"one instant in {key}", "two")
+                    raise _fault(model, key, item, name, f"one instant in {key}", "two")
                 given.add(peer)
-                _check_time(system, key, item, duration, frame_s)
+                _check_time(model, key, item, duration, frame_s)
                 array[peer] = round(item.at / schedule.quantum)
                 if key == "leaves" and item.at <= (join := joins[peer] * schedule.quantum):
-                    raise _fault(system, key, item, f"leave of {name}", f"after its join at {_s(join)}")
+                    raise _fault(model, key, item, f"leave of {name}", f"after its join at {_s(join)}")
     presence = Presence(joins, leaves, first)
-    _check_links(system, presence, mistakes)
+    _check_links(model, presence, mistakes)
     mistakes.raise_if_any()
     changes = presence.changes(int(duration / schedule.quantum))
     for instant, present in zip([0, *changes.tolist()], presence.at(np.append(0, changes)), strict=True):
-        _check_counts(system, present, instant * schedule.quantum)
+        _check_counts(model, present, instant * schedule.quantum)
     return presence
 
 
-def _check_links(system: Model, presence: Presence, mistakes: Mistakes) -> None:
+def _check_links(model: Model, presence: Presence, mistakes: Mistakes) -> None:
     """Record each link that does not allow joins and leaves."""
-    key = "joins" if system.experiment.joins else "leaves"
-    location = location_of(system, key, getattr(system.experiment, key)[0])
+    key = "joins" if model.experiment.joins else "leaves"
+    location = location_of(model, key, getattr(model.experiment, key)[0])
     constant_hub = bool(presence.joins[0] == 0 and presence.leaves[0] == NEVER)
-    for link in system.links:
+    for link in model.links:
         graphs = ["complete", *["star"] * constant_hub, *["ring"] * (link.channel is None)]
         permitted = [("graph", link.graph.shape, graphs)]
         for channel in link.channels:
@@ -151,32 +151,32 @@ def _check_links(system: Model, presence: Presence, mistakes: Mistakes) -> None:
                 mistakes.add("E914", location, subject, expected=expected, got=got, **how)
 
 
-def _peer_of(system: Model, key: str, item: PeerTime) -> tuple[Group, int]:
+def _peer_of(model: Model, key: str, item: PeerTime) -> tuple[Group, int]:
     """Return the group and the number, from 1, of a peer such as "user[2]"; "user" is the peer of a group of
     one.
     """
     parsed = _PEER.fullmatch(item.peer.strip())
-    groups = {group.name: group for group in system.groups}
+    groups = {group.name: group for group in model.groups}
     group = groups.get(parsed["group"]) if parsed else None
     if parsed and group and group.count > 1 and not parsed["number"]:
         expected = f"one peer of the group, {group.name}[1] to {group.name}[{group.count}]"
         fix = _written(key, replace(item, peer=f"{group.name}[1]"), _s(item.at))
-        raise _fault(system, key, item, key, expected, group.name, fix)
+        raise _fault(model, key, item, key, expected, group.name, fix)
     if parsed and group and 1 <= (number := int(parsed["number"] or 1)) <= group.count:
         return group, number
-    known = ", ".join(f"{group.name}[1] to {group.name}[{group.count}]" for group in system.groups[:4])
+    known = ", ".join(f"{group.name}[1] to {group.name}[{group.count}]" for group in model.groups[:4])
     fix, advice = "", ""
     if parsed and group and int(parsed["number"] or 1) > group.count:
         name, least = group_count(group.name), parsed["number"]
         fix, advice = ("", f"raise {name} to {least}") if item.line else (f"--set {name}={least}", "")
-    raise _fault(system, key, item, key, f"a peer of the topology ({known})", item.peer[:40], fix, advice)
+    raise _fault(model, key, item, key, f"a peer of the topology ({known})", item.peer[:40], fix, advice)
 
 
-def _check_time(system: Model, key: str, item: PeerTime, duration: Fraction, frame_s: Fraction) -> None:
+def _check_time(model: Model, key: str, item: PeerTime, duration: Fraction, frame_s: Fraction) -> None:
     """Raise E914 for an instant that is not within the simulation, or not the start of a frame."""
     subject = f"{key.removesuffix('s')} of {item.peer.strip()}"
     if not 0 < item.at < duration:
-        raise _fault(system, key, item, subject, f"more than 0 s and less than the duration, {_s(duration)}")
+        raise _fault(model, key, item, subject, f"more than 0 s and less than the duration, {_s(duration)}")
     if abs(item.at - round(item.at / frame_s) * frame_s) > ROUNDED * frame_s:
         before = item.at // frame_s * frame_s
         near = [at for at in (before, before + frame_s) if 0 < at < duration]
@@ -184,58 +184,58 @@ def _check_time(system: Model, key: str, item: PeerTime, duration: Fraction, fra
         nearest = min(near, key=lambda at: abs(at - item.at), default=None)
         listed = " or ".join(map(_s, near))
         fix = "" if nearest is None else _written(key, item, _s(nearest))
-        raise _fault(system, key, item, subject, f"{expected}, {listed}" if near else expected, fix=fix)
+        raise _fault(model, key, item, subject, f"{expected}, {listed}" if near else expected, fix=fix)
 
 
-def _check_counts(system: Model, present: Flags, at: Fraction) -> None:
+def _check_counts(model: Model, present: Flags, at: Fraction) -> None:
     """Raise E914 if a group has no present peer from an instant on, or all groups too few."""
-    counts = counts_of(system, present)
-    for group, count in zip(system.groups, counts, strict=True):
-        least = max(1, least_peers(system.peer_types) - sum(counts) + count)
+    counts = counts_of(model, present)
+    for group, count in zip(model.groups, counts, strict=True):
+        least = max(1, least_peers(model.peer_types) - sum(counts) + count)
         if count < least:
             subject = f"peers of {group.name} from {_s(at)} on"
-            raise _fault(system, *_change_at(system, at), subject, f"at least {least}", str(count))
+            raise _fault(model, *_change_at(model, at), subject, f"at least {least}", str(count))
 
 
-def _change_at(system: Model, at: Fraction) -> tuple[str, PeerTime]:
+def _change_at(model: Model, at: Fraction) -> tuple[str, PeerTime]:
     """Return the key and the entry of the last join or leave at an instant, by default of the first one."""
-    items = [(key, item) for key in ("joins", "leaves") for item in getattr(system.experiment, key)]
+    items = [(key, item) for key in ("joins", "leaves") for item in getattr(model.experiment, key)]
     return next((pair for pair in reversed(items) if pair[1].at == at), items[0])
 
 
-def packets_fault(system: Model, at: Fraction) -> ApcError:
+def packets_fault(model: Model, at: Fraction) -> ApcError:
     """Return the error E914 of a change after which no packets have some delay or clock of the links."""
     subject, expected = f"packets from {_s(at)} on", "all delays and clocks of the links in use"
     advice = "keep at least two peers of each group"
-    return _fault(system, *_change_at(system, at), subject, expected, "fewer", advice=advice)
+    return _fault(model, *_change_at(model, at), subject, expected, "fewer", advice=advice)
 
 
-def counts_of(system: Model, present: Flags) -> list[int]:
+def counts_of(model: Model, present: Flags) -> list[int]:
     """Return the number of present peers of each group."""
-    starts = [*first_peers(system).values()]
+    starts = [*first_peers(model).values()]
     counts: list[int] = np.add.reduceat(present.astype(np.int64), starts).tolist()
     return counts
 
 
-def model_of_present(system: Model, present: Flags) -> Model:
+def model_of_present(model: Model, present: Flags) -> Model:
     """Return the model of the present peers (N,) only, numbered anew in each group, without joins and leaves.
 
     Raises ApcError for numbers of peers that the model can't have.
     """
-    own = {count_of(link.name) for link in system.links}
-    starts = first_peers(system)
+    own = {count_of(link.name) for link in model.links}
+    starts = first_peers(model)
     plain = replace(
-        always_present(system),
+        always_present(model),
         groups=tuple(
             replace(group, columns=tuple(column for column in group.columns if column.name in own))
-            for group in system.groups
+            for group in model.groups
         ),
     )
     changed = apply(
         plain,
         [
-            Override(find(system, group_count(group.name), OVERRIDE, counts=True), Fraction(count))
-            for group, count in zip(system.groups, counts_of(system, present), strict=True)
+            Override(find(model, group_count(group.name), OVERRIDE, counts=True), Fraction(count))
+            for group, count in zip(model.groups, counts_of(model, present), strict=True)
             if count != group.count
         ],
     )
@@ -251,7 +251,7 @@ def model_of_present(system: Model, present: Flags) -> Model:
                     if column.name not in own
                 ),
             )
-            for old, new in zip(system.groups, changed.groups, strict=True)
+            for old, new in zip(model.groups, changed.groups, strict=True)
         ),
     )
 
@@ -264,7 +264,7 @@ def model_at_end(simulation: Simulation) -> Model:
 
 
 def _fault(
-    system: Model,
+    model: Model,
     key: str,
     item: PeerTime,
     subject: str,
@@ -274,7 +274,7 @@ def _fault(
     advice: str = "",
 ) -> ApcError:
     """Return the error E914 of a join or leave, at its location."""
-    return fault("E914", location_of(system, key, item), subject, expected, got or _s(item.at), fix, advice)
+    return fault("E914", location_of(model, key, item), subject, expected, got or _s(item.at), fix, advice)
 
 
 def _written(key: str, item: PeerTime, at: str) -> str:

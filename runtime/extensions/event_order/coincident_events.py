@@ -145,9 +145,9 @@ def event_order(
     ApcError
         The errors of the analysis under the default conventions.
     """
-    system = numeric.model
+    model = numeric.model
     default = default or analyze(numeric)
-    subsystems = [numeric.jacobians[group.peer_type] for group in system.groups]
+    subsystems = [numeric.jacobians[group.peer_type] for group in model.groups]
     start_matters = any(map(_depends_on_received, subsystems))
     discrete_states = any(send.u.any() for subsystem in subsystems for send in subsystem.pattern.sends)
     departure_pairs = {
@@ -176,7 +176,7 @@ def event_order(
     def default_alone(reason: str) -> EventOrder:
         """Return the default outcome alone, with the reason for not repeating the analysis."""
         first = replace(outcome([ORDER], starts[0], default, default.frame_s), departures=())
-        return EventOrder(system.name, (first,), start_matters, reason)
+        return EventOrder(model.name, (first,), start_matters, reason)
 
     if quick and (reason := _reason_not_repeated(numeric, default, 1)):
         return default_alone(reason)
@@ -193,7 +193,7 @@ def event_order(
             except ApcError as refused:
                 result = refused
         outcomes.append(outcome(orders, start, result, default.frame_s))
-    return EventOrder(system.name, tuple(outcomes), start_matters, "")
+    return EventOrder(model.name, tuple(outcomes), start_matters, "")
 
 
 def _orders_by_frame(numeric: NumericModel, pairs: Sequence[tuple[str, str]]) -> list[list[Order]]:

@@ -75,19 +75,19 @@ def channel_growth(
     NotSupportedError
         The network is not supported.
     """
-    system = numeric.model
+    model = numeric.model
     if any(law.trace is not None for _, law in lossy):
         return _trace_growth(numeric)
     if any(law.jitter for _, law in lossy):
         raise NotSupportedError("jitter together with bursty losses of another link, or on_loss: zero")
     if not any(law.mean_loss and law.zero for _, law in lossy):
         return _burst_growth(numeric, None)
-    first = _arrival_time(system, lossy)
+    first = _arrival_time(model, lossy)
     if all(is_memoryless(law) for _, law in lossy):
         reception = build_reception(numeric, first=first, stand_in=True)
         # With many peers the quadrature nodes are rounded.
-        proved = system.peers <= ENUMERATED
-        growth = independent_growth(system, reception, self_substitution, arrival=first, bounded=bounded)
+        proved = model.peers <= ENUMERATED
+        growth = independent_growth(model, reception, self_substitution, arrival=first, bounded=bounded)
         return replace(growth, proved=proved, quick=proved)
     return _burst_growth(numeric, first)
 
@@ -118,30 +118,30 @@ def _burst_growth(numeric: NumericModel, first: Fraction | None) -> StabilityMea
     numeric, first
         As for `_independent_growth`.
     """
-    system = numeric.model
+    model = numeric.model
     reception = build_reception(numeric, first=first or Fraction(0), stand_in=first is not None)
-    complete = all(link.graph.shape == "complete" for link in system.links)
-    interchangeable = complete and len(system.groups) == 1 and not system.groups[0].columns
+    complete = all(link.graph.shape == "complete" for link in model.links)
+    interchangeable = complete and len(model.groups) == 1 and not model.groups[0].columns
     channels = MOST_CHANNELS
     if first is None:
-        refuse_unheld(system, reception)
-        links = [link for link in system.links if link.channel]
-        channels = sum(channels_of(link, system.peers) for link in links)
-        interchangeable = interchangeable and len(links) == 1 and system.peers <= MOST_TAGGED
+        refuse_unheld(model, reception)
+        links = [link for link in model.links if link.channel]
+        channels = sum(channels_of(link, model.peers) for link in links)
+        interchangeable = interchangeable and len(links) == 1 and model.peers <= MOST_TAGGED
         if not interchangeable and channels > MOST_CHANNELS:
             message = f"the limit is {MOST_CHANNELS}, or {MOST_TAGGED} equal peers with on_loss: hold"
             raise NotSupportedError(f"bursts on {channels} directed connections: {message}")
-    orders = (channels,) if system.peers <= EXACTLY_TAGGED or channels <= MOST_CHANNELS else ORDERS
+    orders = (channels,) if model.peers <= EXACTLY_TAGGED or channels <= MOST_CHANNELS else ORDERS
 
     def frame(reception: PerTickReception) -> LossyFrame:
         """Return the frame map of the peers, as a function of the losses."""
         if first is None:
-            return hold_frame(system, reception, interchangeable=interchangeable)
-        return substitution_frame(system, reception, MOST_CHANNELS, interchangeable=interchangeable)
+            return hold_frame(model, reception, interchangeable=interchangeable)
+        return substitution_frame(model, reception, MOST_CHANNELS, interchangeable=interchangeable)
 
     def errors() -> tuple[float, str]:
         """Return the copy error in m, and a note."""
-        pushed = forced(system, reception, first or Fraction(0))
+        pushed = forced(model, reception, first or Fraction(0))
         whole = frame(pushed.reception)
         rough, *more = (tagged_error(whole, order, pushed.peer_by_peer()) for order in orders)
         return (more[0], f"{ESTIMATE} it is {rough:.9g} m") if more else (rough, "")
@@ -157,7 +157,7 @@ def _burst_growth(numeric: NumericModel, first: Fraction | None) -> StabilityMea
     )
 
 
-def _arrival_time(system: Model, lossy: Sequence[tuple[Link, ChannelLaw]]) -> Fraction:
+def _arrival_time(model: Model, lossy: Sequence[tuple[Link, ChannelLaw]]) -> Fraction:
     """Return the arrival time of packets within a frame, in seconds.
 
     Raises
@@ -165,15 +165,15 @@ def _arrival_time(system: Model, lossy: Sequence[tuple[Link, ChannelLaw]]) -> Fr
     NotSupportedError
         The arrival time is not unique.
     """
-    timings = resolve(system).timings
-    clocks = {clock.name: clock for clock in system.clocks}
-    if len(system.links) > 1 or system.links[0].pairs:
+    timings = resolve(model).timings
+    clocks = {clock.name: clock for clock in model.clocks}
+    if len(model.links) > 1 or model.links[0].pairs:
         raise NotSupportedError("substituted values together with packets of another link or delay")
     link = lossy[0][0]
     if link.after:
         raise NotSupportedError(f"substituted values for packets after the ticks ({link.name}: order: after)")
     period, phase = timings[clocks[link.clock].period], timings[clocks[link.clock].phase]
-    frame = common_multiple([timings[clock.period] for clock in system.clocks])
+    frame = common_multiple([timings[clock.period] for clock in model.clocks])
     if frame != period:
         raise NotSupportedError(f"several packets of {link.name} in a frame of {float(frame) * 1e3:.6g} ms")
     return (phase + timings[link.delay]) % period

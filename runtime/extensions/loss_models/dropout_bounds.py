@@ -122,12 +122,12 @@ def worst_case(numeric: NumericModel) -> ConsecutiveLosses:
     return ConsecutiveLosses(certified, pattern, growth, note, certificate)
 
 
-def worst_trace(system: Model) -> Model:
+def worst_trace(model: Model) -> Model:
     """Return a system whose unreliable links lose packets by the destabilizing pattern, periodically.
 
     Parameters
     ----------
-    system
+    model
         The model, with the parameter values to simulate.
 
     Raises
@@ -135,20 +135,18 @@ def worst_trace(system: Model) -> Model:
     ApcError
         E897 no such pattern is known, or it can't be simulated.
     """
-    losses_in_a_row = worst_case(numeric_model(system))
+    losses_in_a_row = worst_case(numeric_model(model))
     pattern = losses_in_a_row.unstable_pattern
     if pattern is None:
         message = f"--trace-of worst has no pattern: {losses_in_a_row.note}"
-        raise ApcError(
-            Diagnostic("E897", SourceLocation(system.origin.topology), message, fix="apc simulate")
-        )
-    seconds = {timing.name: float(timing.value) for timing in system.timings}
-    for link in system.links:
+        raise ApcError(Diagnostic("E897", SourceLocation(model.origin.topology), message, fix="apc simulate"))
+    seconds = {timing.name: float(timing.value) for timing in model.timings}
+    for link in model.links:
         delays = {seconds[name] for name in link.delays}
         if link.channel is not None and len(delays) > 1:
             message = f"--trace-of worst requires one delay of {link.name}; it has several"
             raise ApcError(
-                Diagnostic("E897", SourceLocation(system.origin.topology), message, fix="apc simulate")
+                Diagnostic("E897", SourceLocation(model.origin.topology), message, fix="apc simulate")
             )
 
     def with_pattern(link: Link) -> Link:
@@ -158,21 +156,21 @@ def worst_trace(system: Model) -> Model:
         trace = np.where(pattern, np.inf, seconds[link.delay])
         return replace(link, channel=replace(link.channel, loss=None, jitter=None, trace=trace), pairs=())
 
-    return replace(system, links=tuple(map(with_pattern, system.links)))
+    return replace(model, links=tuple(map(with_pattern, model.links)))
 
 
 def _modes(numeric: NumericModel) -> tuple[list[LossMode], float]:
     """Return the modes of a model whose receivers hold the last received value, and ‖|W|‖₂."""
-    system = numeric.model
+    model = numeric.model
     reception = build_reception(numeric)
-    refuse_unheld(system, reception)
+    refuse_unheld(model, reception)
     if mixed := [
-        link.name for link in system.links if len({channel.loss is None for channel in link.channels}) > 1
+        link.name for link in model.links if len({channel.loss is None for channel in link.channels}) > 1
     ]:
         raise NotSupportedError(f"only some pairs of groups lose packets of {mixed[0]}")
     loops = orthogonal_loops(reception.groups, reception.exchange, GAIN_BOUND_STATES)
-    lossy = frozenset(link.name for link in system.links if link.channel is not None)
-    packets = Packets(system, reception)
+    lossy = frozenset(link.name for link in model.links if link.channel is not None)
+    packets = Packets(model, reception)
     packet_numbers = {row: packets.received(row)[0] for row in packets.rows}
     depths = packets.depths(packet_numbers.items(), 1)
     # A lost packet is replaced by the previous one, which is sent again.
@@ -237,10 +235,10 @@ def _harmless_losses(modes: Sequence[LossMode], weight: float) -> int | None:
     return 0
 
 
-def _channels(system: Model) -> int:
+def _channels(model: Model) -> int:
     """Return the number of channels that lose packets."""
-    peers = sum(group.count for group in system.groups)
-    return sum(channels_of(link, peers) for link in system.links if link.channel is not None)
+    peers = sum(group.count for group in model.groups)
+    return sum(channels_of(link, peers) for link in model.links if link.channel is not None)
 
 
 def _longest_burst(pattern: Sequence[bool]) -> int:

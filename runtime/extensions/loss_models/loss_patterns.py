@@ -72,7 +72,7 @@ class LossyFrame:
         return len(self.offsets) - 1
 
 
-def refuse_unheld(system: Model, reception: PerTickReception) -> None:
+def refuse_unheld(model: Model, reception: PerTickReception) -> None:
     """Raise an error unless receivers hold the last received value, with one packet per frame.
 
     Raises
@@ -81,8 +81,8 @@ def refuse_unheld(system: Model, reception: PerTickReception) -> None:
         The link that is not supported, and the reason.
     """
     rows = [row for group_rows in reception.rows.values() for row in group_rows]
-    clocks = {clock.name: clock for clock in system.clocks}
-    for link in system.links:
+    clocks = {clock.name: clock for clock in model.clocks}
+    for link in model.links:
         if len(link.clocks) > 1:
             raise NotSupportedError(f"pairs of groups of {link.name} have different clocks")
         for channel in link.channels:
@@ -110,19 +110,19 @@ def channels_of(link: Link, peers: int) -> int:
     return peers * (peers - 1) if link.graph.shape == "complete" else len(arcs(link.graph, peers)[0])
 
 
-def hold_frame(system: Model, reception: PerTickReception, *, interchangeable: bool = False) -> LossyFrame:
+def hold_frame(model: Model, reception: PerTickReception, *, interchangeable: bool = False) -> LossyFrame:
     """Return the lossy frame of peers whose receivers hold the last received value.
 
     Parameters
     ----------
-    system, reception
+    model, reception
         The model and its peers.
     interchangeable
         Whether the peers are exchangeable.
     """
     loop = dense_loop(reception.groups, reception.exchange)
-    memories = stored_of(system, reception, loop)
-    links = {link.name: link for link in system.links}
+    memories = stored_of(model, reception, loop)
+    links = {link.name: link for link in model.links}
     received_channels, loss_channels, laws = list[ReceivedChannel](), list[LossChannel](), list[ChannelLaw]()
     for number, memory in enumerate(memory for memory in memories if any(memory.sizes)):
         routes = [
@@ -135,7 +135,7 @@ def hold_frame(system: Model, reception: PerTickReception, *, interchangeable: b
             if any(weights.values()):
                 received_channels.append(ReceivedChannel(g, memory.route, weights))
                 loss_channels.append((g, h, number))
-                laws.append(channel_law(system, links[memory.route[0]], memory.route[1]))
+                laws.append(channel_law(model, links[memory.route[0]], memory.route[1]))
     no_neutral_modes = np.zeros((sum(len(subsystem.z_names) for subsystem in loop.subsystems), 0))
     means = mean_loop(loop, reception.of(loop), memories, received_channels, no_neutral_modes)
     matrix, first = value_of(means.matrix), means.offsets[-1]
@@ -177,13 +177,13 @@ def hold_frame(system: Model, reception: PerTickReception, *, interchangeable: b
 
 
 def substitution_frame(
-    system: Model, reception: PerTickReception, most: int, *, interchangeable: bool = False
+    model: Model, reception: PerTickReception, most: int, *, interchangeable: bool = False
 ) -> LossyFrame:
     """Return the lossy frame of peers that substitute their own values for missing ones.
 
     Parameters
     ----------
-    system, reception
+    model, reception
         The model and its peers.
     most
         The limit of channels.
@@ -202,7 +202,7 @@ def substitution_frame(
     matrix: the part without ν is A, and the factor of ν_S is F_S.
     """
     loop = dense_loop(reception.groups, reception.exchange)
-    receivers, offsets, law = receivers_of(system, reception, loop, loop.coupling)
+    receivers, offsets, law = receivers_of(model, reception, loop, loop.coupling)
     senders_of_peers = [np.flatnonzero(receiver.received.any(axis=0)).tolist() for receiver in receivers]
     loss_channels = [(h, g, 0) for h, senders in enumerate(senders_of_peers) for g in senders]
     if len(loss_channels) > most:

@@ -49,16 +49,16 @@ def top_lyapunov_exponent(numeric: NumericModel, *, seed: int = 0) -> TopLyapuno
     seed
         The seed of the random losses.
     """
-    system = numeric.model
+    model = numeric.model
     reception = build_reception(numeric)
-    refuse_unheld(system, reception)
-    lossy = [link for link in system.links if link.channel]
+    refuse_unheld(model, reception)
+    lossy = [link for link in model.links if link.channel]
     states = sum(len(group.z_names) * group.count for group in reception.groups)
-    states += sum(channels_of(link, system.peers) for link in lossy)
+    states += sum(channels_of(link, model.peers) for link in lossy)
     if states > LYAPUNOV_STATES:
-        message = f"{system.peers:,} peers and their channels have {states:,} states"
+        message = f"{model.peers:,} peers and their channels have {states:,} states"
         raise NotSupportedError(f"{message}; the limit is {LYAPUNOV_STATES}")
-    frame = hold_frame(system, reception)
+    frame = hold_frame(model, reception)
     share = np.array([law.mean_loss for law in frame.laws])[:, None, None]
     n, count, width = len(frame.mean), len(frame.laws), frame.reception_errors.shape[1]
     noise_inputs = frame.input.transpose(1, 0, 2).reshape(n, count * width)

@@ -63,13 +63,13 @@ class Packets:
     `slots` is the number of packets per frame on each link.
     """
 
-    def __init__(self, system: Model, reception: PerTickReception) -> None:
-        if several := [link.name for link in system.links if len(link.clocks) > 1]:
+    def __init__(self, model: Model, reception: PerTickReception) -> None:
+        if several := [link.name for link in model.links if len(link.clocks) > 1]:
             raise NotSupportedError(f"pairs of groups of {several[0]} have different clocks")
         self.reception = reception
         self.rows = dict.fromkeys(row for rows in reception.rows.values() for row in rows)
-        self.links = {link.name: link for link in system.links}
-        self.times = {clock.name: instants(reception, clock) for clock in system.clocks}
+        self.links = {link.name: link for link in model.links}
+        self.times = {clock.name: instants(reception, clock) for clock in model.clocks}
         self.slots = {name: len(self.times[link.clock]) for name, link in self.links.items()}
 
     def received(

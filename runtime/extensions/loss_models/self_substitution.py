@@ -107,19 +107,19 @@ def quadrature(n: int, lost: float, most: int) -> tuple[Floats, Floats]:
     return nodes, vectors[0] ** 2
 
 
-def self_substitution(system: Model, reception: PerTickReception) -> Moments:
+def self_substitution(model: Model, reception: PerTickReception) -> Moments:
     """Return the second-moment operator of peers that substitute their own values for missing ones.
 
     Parameters
     ----------
-    system
+    model
         The model.
     reception
         The peers, from `class_moments.build_reception` with substitutes; packets are due at the start of
         frames.
     """
     classes = classes_of(reception)
-    receivers, offsets, _ = receivers_of(system, reception, classes.common, classes.weights)
+    receivers, offsets, _ = receivers_of(model, reception, classes.common, classes.weights)
     sizes = np.diff(offsets).tolist()
     width = max(sizes)
     blocks, moment_coordinates = [], []
@@ -154,26 +154,26 @@ def self_substitution(system: Model, reception: PerTickReception) -> Moments:
 
 
 def receivers_of(
-    system: Model, reception: PerTickReception, common: ModalSystem, weights: Coupling
+    model: Model, reception: PerTickReception, common: ModalSystem, weights: Coupling
 ) -> tuple[list[Receiver], list[int], ChannelLaw]:
     """Return the receiver dynamics of each class, the offsets of their states, and the channel law of the
     losses.
 
     Parameters
     ----------
-    system, reception
+    model, reception
         The model and its peers.
     common
         The loop of all classes of peers.
     weights
         The coupling weight of a peer of one class at a peer of another.
     """
-    stored = stored_of(system, reception, common, perfect=True)
+    stored = stored_of(model, reception, common, perfect=True)
     if len(stored) != 1:
         raise NotSupportedError("substituted values together with packets of other links")
     (memory,) = stored
-    link = next(link for link in system.links if link.name == memory.route[0])
-    law = channel_law(system, link, memory.route[1])
+    link = next(link for link in model.links if link.name == memory.route[0])
+    law = channel_law(model, link, memory.route[1])
     counts = [subsystem.count for subsystem in common.subsystems]
     subsystems = [with_memory(group, stored) for group in common.subsystems]
     received_now = sorted(set(memory.memory.received.values()))

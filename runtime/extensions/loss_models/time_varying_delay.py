@@ -53,14 +53,14 @@ LONGEST, LONGER = 8, 12
 ABOVE = 1 + 1e-3
 
 
-def loop_gain(system: Model, delay: ParameterRef, low: Fraction, high: Fraction) -> float:
+def loop_gain(model: Model, delay: ParameterRef, low: Fraction, high: Fraction) -> float:
     """Return an upper bound of the small-gain product, proved; infinite if unstable at the middle.
 
     At a kink the result is the largest over all sides.
 
     Parameters
     ----------
-    system
+    model
         The model.
     delay
         The delay of a link, or of some pairs of its peers.
@@ -72,19 +72,19 @@ def loop_gain(system: Model, delay: ParameterRef, low: Fraction, high: Fraction)
     NotSupportedError
         The reason why no bound can be computed.
     """
-    return max(_loop_gain(side.numeric, delay, low, high) for side in sides(numeric_model(system)))
+    return max(_loop_gain(side.numeric, delay, low, high) for side in sides(numeric_model(model)))
 
 
 def _loop_gain(numeric: NumericModel, delay: ParameterRef, low: Fraction, high: Fraction) -> float:
     """Return `loop_gain` on one side of a kink."""
-    system = numeric.model
-    middle = apply(system, [Override(delay, (low + high) / 2)])
-    (link,) = (link for link in system.links if delay.name in link.delays)
-    if [name for name in link.delays if delay.name in scope_of(system).needed([name])] != [delay.name]:
+    model = numeric.model
+    middle = apply(model, [Override(delay, (low + high) / 2)])
+    (link,) = (link for link in model.links if delay.name in link.delays)
+    if [name for name in link.delays if delay.name in scope_of(model).needed([name])] != [delay.name]:
         raise NotSupportedError(f"the delays of several pairs of groups depend on {delay.label}")
     if any(
         receive.age or receive.before
-        for peer_type in system.peer_types
+        for peer_type in model.peer_types
         for clock in peer_type.clocks
         for receive in clock.receives
     ):
@@ -127,14 +127,14 @@ def _loop_gain(numeric: NumericModel, delay: ParameterRef, low: Fraction, high: 
 
 
 def unstable_delays(
-    system: Model, delay: ParameterRef, low: Fraction, high: Fraction
+    model: Model, delay: ParameterRef, low: Fraction, high: Fraction
 ) -> tuple[int, int] | None:
     """Return a destabilizing periodic sequence of delays: the numbers of packets with the smallest and
     largest delay.
 
     Parameters
     ----------
-    system, delay, low, high
+    model, delay, low, high
         As for `loop_gain`; None where no such delays of at most `LONGER` packets are proved unstable.
     """
     sequences = [(first, total - first) for total in range(2, LONGEST + 1) for first in range(1, total)]
@@ -147,9 +147,9 @@ def unstable_delays(
         channel = replace(HOLDING, trace=trace)
         links = tuple(
             replace(link, channel=channel) if link.delay == delay.name and not link.pairs else link
-            for link in system.links
+            for link in model.links
         )
-        recorded = replace(system, links=links)
-        if links != system.links and trace_radius(numeric_model(recorded)).low > 1:
+        recorded = replace(model, links=links)
+        if links != model.links and trace_radius(numeric_model(recorded)).low > 1:
             return first, second
     return None

@@ -119,12 +119,12 @@ class PaperMethod(Result):
     eigenvalues: NDArray[np.complex128]
 
 
-def paper_method(system: Model) -> PaperMethod:
+def paper_method(model: Model) -> PaperMethod:
     """Return the matrices of the paper's method.
 
     Parameters
     ----------
-    system
+    model
         The compiled model, with the parameter values to analyse.
 
     Raises
@@ -133,11 +133,11 @@ def paper_method(system: Model) -> PaperMethod:
         E861 a model that is not of the paper's form, with the differences; E862 matrices that would be too
         large; and the errors of an analysis.
     """
-    with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
-        return _named_matrices(_open_loop(system, dense(*lifted_classes(numeric_model(system)))))
+    with single_threaded(), finite_equations(model.origin.topology), np.errstate(all="ignore"):
+        return _named_matrices(_open_loop(model, dense(*lifted_classes(numeric_model(model)))))
 
 
-def analyze_paper(system: Model) -> Analysis:
+def analyze_paper(model: Model) -> Analysis:
     """Return the stability analysis of a model by the paper's method.
 
     The rigid modes are removed by their known directions: the participation of modes is in relative
@@ -145,7 +145,7 @@ def analyze_paper(system: Model) -> Analysis:
 
     Parameters
     ----------
-    system
+    model
         The compiled model, with the parameter values to analyse.
 
     Raises
@@ -153,22 +153,22 @@ def analyze_paper(system: Model) -> Analysis:
     ApcError
         As for `paper_method`; E861 also for a model with a drift.
     """
-    with single_threaded(), finite_equations(system.origin.topology), np.errstate(all="ignore"):
-        closed_loop = dense(*lifted_classes(numeric_model(system)))
-        loop = _open_loop(system, closed_loop)
+    with single_threaded(), finite_equations(model.origin.topology), np.errstate(all="ignore"):
+        closed_loop = dense(*lifted_classes(numeric_model(model)))
+        loop = _open_loop(model, closed_loop)
         rigid = find_rigid_modes(closed_loop)
         if rigid.drifts:
-            raise _form_error(system, ["a topology without unbounded rigid-body motion"])
+            raise _form_error(model, ["a topology without unbounded rigid-body motion"])
         spectrum = _with_phase_advance(
             solve_spectrum([_without_rigid(loop, closed_loop, rigid)]), solve_spectrum([closed_loop])
         )
     neutral_modes = classify_neutral_modes(closed_loop)
     zero, size = (loop.ratio - 1) * len(loop.states), loop.starts[-1]
     return Analysis(
-        topology=system.name,
-        peers=system.peers,
+        topology=model.name,
+        peers=model.peers,
         frame_s=loop.frame_s,
-        states_per_peer=-(-(size - zero) // system.peers),
+        states_per_peer=-(-(size - zero) // model.peers),
         method=PAPER,
         verdict=(
             up_to(neutral_modes.translations, neutral_modes.rotations)
@@ -189,7 +189,7 @@ def analyze_paper(system: Model) -> Analysis:
             f"A_cl is {size} × {size}; {zero} of its columns, and as many eigenvalues, are zero",
             *spectrum.notes,
         ),
-        limitations=limitations(system),
+        limitations=limitations(model),
     )
 
 
@@ -255,12 +255,12 @@ def _floats(signals: Sequence[_Signal], width: int) -> Floats:
     return _weights(signals, width).astype(np.float64)
 
 
-def _open_loop(system: Model, closed_loop: ClosedLoop) -> _OpenLoopMatrices:
+def _open_loop(model: Model, closed_loop: ClosedLoop) -> _OpenLoopMatrices:
     """Return the matrices of the model of all peers, cut open at every force."""
     subsystems = closed_loop.subsystems
-    period, frame = _periods(system, subsystems)
+    period, frame = _periods(model, subsystems)
     ratio = int(frame / period)
-    timings = {timing.name: timing.value for timing in system.timings}
+    timings = {timing.name: timing.value for timing in model.timings}
     starts = [0, *itertools.accumulate(len(group.jacobians.peer_type.states) for group in subsystems)]
     n = starts[-1]
     if (n + 2 * len(subsystems)) * ratio > MOST_ROWS:
@@ -268,7 +268,7 @@ def _open_loop(system: Model, closed_loop: ClosedLoop) -> _OpenLoopMatrices:
             f"the paper's matrices for {len(subsystems)} peers at {ratio} force ticks a frame have more than "
             f"{MOST_ROWS:,} rows"
         )
-        raise ApcError(Diagnostic("E862", SourceLocation(system.origin.topology), message, fix=_INSTEAD))
+        raise ApcError(Diagnostic("E862", SourceLocation(model.origin.topology), message, fix=_INSTEAD))
     sent = [
         {
             (sending.link, channel): row
@@ -552,13 +552,13 @@ def _with_phase_advance(spectrum: Spectrum, direct: Spectrum) -> Spectrum:
 # ---- the paper's form ----
 
 
-def _periods(system: Model, subsystems: Sequence[PeerClass]) -> tuple[Fraction, Fraction]:
+def _periods(model: Model, subsystems: Sequence[PeerClass]) -> tuple[Fraction, Fraction]:
     """Return the periods T_c and T_n in seconds.
 
     An error with all differences if the form is not the paper's.
     """
-    timings = {timing.name: timing.value for timing in system.timings}
-    link_clock = {link.name: link.clock for link in system.links}
+    timings = {timing.name: timing.value for timing in model.timings}
+    link_clock = {link.name: link.clock for link in model.links}
     holds = [
         hold
         for group in subsystems
@@ -575,16 +575,16 @@ def _periods(system: Model, subsystems: Sequence[PeerClass]) -> tuple[Fraction, 
         for group in {subsystem.index: subsystem for subsystem in subsystems}.values()
         for text in _form_differences(group)
     ]
-    if any(link.after for link in system.links):
+    if any(link.after for link in model.links):
         missing.append("packets that take the values before the ticks (order: before)")
     for subject, result in (("clock of forces", forces), ("network clock", networks)):
         if len(result) != 1:
             listed = f"got {' and '.join(result) or 'none'}"
             missing.append(f"one {subject} ({listed})")
     if missing:
-        raise _form_error(system, missing)
+        raise _form_error(model, missing)
     fast, slow = (
-        next(clock for clock in system.clocks if clock.name in names) for names in (forces, networks)
+        next(clock for clock in model.clocks if clock.name in names) for names in (forces, networks)
     )
     period, frame = timings[fast.period], timings[slow.period]
     separation = timings[slow.phase] - timings[fast.phase]
@@ -604,7 +604,7 @@ def _periods(system: Model, subsystems: Sequence[PeerClass]) -> tuple[Fraction, 
         for coupling_term in coupling_terms
     ]
     if missing := [requirement for quotient, requirement in quotients if quotient.denominator != 1]:
-        raise _form_error(system, missing)
+        raise _form_error(model, missing)
     return period, frame
 
 
@@ -627,7 +627,7 @@ def _form_differences(group: PeerClass) -> Iterator[str]:
         yield "packets with positions and velocities only (a held force is sent)"
 
 
-def _form_error(system: Model, missing: Iterable[str]) -> ApcError:
+def _form_error(model: Model, missing: Iterable[str]) -> ApcError:
     """Return the error E861 with the missing properties of the paper's form."""
     message = "method paper does not apply to this topology; missing: " + "; ".join(dict.fromkeys(missing))
-    return ApcError(Diagnostic("E861", SourceLocation(system.origin.topology), message, fix=_INSTEAD))
+    return ApcError(Diagnostic("E861", SourceLocation(model.origin.topology), message, fix=_INSTEAD))

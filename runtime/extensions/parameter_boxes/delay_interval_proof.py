@@ -33,7 +33,7 @@ PARTS = tuple(Fraction(part, 8) for part in range(8, 0, -1))
 
 
 def prove_over_delay(
-    system: Model,
+    model: Model,
     ranges: Sequence[Range],
     prove: Callable[[Model, list[Range]], RobustStability],
     *,
@@ -43,7 +43,7 @@ def prove_over_delay(
 
     Parameters
     ----------
-    system
+    model
         The compiled model.
     ranges
         The ranges of parameters, the delay among them.
@@ -58,7 +58,7 @@ def prove_over_delay(
     ApcError
         E831 two delays, or one that forces use, too; E846 too many segments; the errors of `prove`.
     """
-    delays = [interval for interval in ranges if is_delay(system, interval.free)]
+    delays = [interval for interval in ranges if is_delay(model, interval.free)]
     if len(delays) > 1:
         names = " and ".join(dict.fromkeys(delay.free.label for delay in delays))
         raise ApcError(Diagnostic("E831", LOCATION, f"a box can have one delay range, got {names}"))
@@ -68,8 +68,8 @@ def prove_over_delay(
     cells, undecided = 0, Fraction(0)
     verdict: Term = UNDECIDED
     open_point: tuple[float, ...] = ()
-    for value, share in representative_delays(system, delay):
-        proof = prove(system_with_delay(system, delay.free, value), other_ranges)
+    for value, share in representative_delays(model, delay):
+        proof = prove(system_with_delay(model, delay.free, value), other_ranges)
         cells += proof.cells
         point = (*proof.counterexample[:index], float(value), *proof.counterexample[index:])
         if proof.stable is False:
@@ -82,7 +82,7 @@ def prove_over_delay(
         else:
             verdict = proof.verdict
     stable = None if undecided else True
-    changing_delay = varying_delay_result(system, delay) if nominal and stable and not other_ranges else None
+    changing_delay = varying_delay_result(model, delay) if nominal and stable and not other_ranges else None
     notes = (*proof.notes, *[CONSTANT] * (changing_delay is None))
     result = replace(
         proof, ranges=tuple(ranges), cells=cells, notes=notes, stable=stable, changing=changing_delay
@@ -95,7 +95,7 @@ def prove_over_delay(
     )
 
 
-def varying_delay_result(system: Model, delay: Range) -> ChangingDelay:
+def varying_delay_result(model: Model, delay: Range) -> ChangingDelay:
     """Return the stability result for a delay that changes from packet to packet within a range."""
     extension = find_extension("loss_models")
     if extension is None:
@@ -103,11 +103,11 @@ def varying_delay_result(system: Model, delay: Range) -> ChangingDelay:
     low, width = delay.low, delay.high - delay.low
     try:
         ends = (low + part * width for part in PARTS)
-        proved = next((end for end in ends if extension.loop_gain(system, delay.free, low, end) < 1), None)
+        proved = next((end for end in ends if extension.loop_gain(model, delay.free, low, end) < 1), None)
     except NotSupportedError as why:
         return ChangingDelay(None, None, f"undecided: {why}")
-    has_kinks = len(sides(numeric_model(system))) > 1
+    has_kinks = len(sides(numeric_model(model))) > 1
     unstable = None
     if not has_kinks and proved != delay.high:
-        unstable = extension.unstable_delays(system, delay.free, low, delay.high)
+        unstable = extension.unstable_delays(model, delay.free, low, delay.high)
     return ChangingDelay(None if proved is None else float(proved), unstable)

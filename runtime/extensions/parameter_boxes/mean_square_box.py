@@ -85,12 +85,12 @@ class _BoxProblem:
 
 
 @part("box")
-def prove_mean_square(system: Model, ranges: Sequence[Range], *, cells: int | None = None) -> RobustStability:
+def prove_mean_square(model: Model, ranges: Sequence[Range], *, cells: int | None = None) -> RobustStability:
     """Return a proof of mean-square stability in a box, an unstable point of the box, or neither (undecided).
 
     Parameters
     ----------
-    system
+    model
         The model.
     ranges
         The ranges of the parameters, see `extensions.parameter_boxes.parametric_frames.parse_range`.
@@ -104,7 +104,7 @@ def prove_mean_square(system: Model, ranges: Sequence[Range], *, cells: int | No
         `parametric_frames.parametric_subsystems`.
     """
     with single_threaded(), np.errstate(all="ignore"):
-        problem = _box_problem(system, ranges)
+        problem = _box_problem(model, ranges)
         for loop in (separation.loop for separation in problem.classes.loops):
             loop_without_packets = without_packets(loop)
             if not stays_rigid(
@@ -118,11 +118,11 @@ def prove_mean_square(system: Model, ranges: Sequence[Range], *, cells: int | No
                     f"{loop.name}: a rigid mode has a direction that depends on the parameters, so no box "
                     "can be proved"
                 )
-                return RobustStability(system.name, tuple(ranges), UNDECIDED, None, 0, 1.0, (), (note,))
+                return RobustStability(model.name, tuple(ranges), UNDECIDED, None, 0, 1.0, (), (note,))
         is_unstable = partial(_is_unstable, problem)
         cell_tests = partial(_test_cells, problem), is_unstable
         return search_box(
-            system.name,
+            model.name,
             ranges,
             *cell_tests,
             stable=MeanSquareVerdict.STABLE,
@@ -131,11 +131,11 @@ def prove_mean_square(system: Model, ranges: Sequence[Range], *, cells: int | No
         )
 
 
-def _box_problem(system: Model, ranges: Sequence[Range]) -> _BoxProblem:
+def _box_problem(model: Model, ranges: Sequence[Range]) -> _BoxProblem:
     """Return a model with its parametric frames, and the receiver memory at the middle of the box."""
-    numbers = channel_numbers(system)
+    numbers = channel_numbers(model)
     peer_ranges = tuple(index for index, interval in enumerate(ranges) if interval.free.name not in numbers)
-    numeric = numeric_model(system)
+    numeric = numeric_model(model)
 
     def lifted(changed: Model) -> Any:
         """Return the groups and links of a model with a row of r for each tick."""
@@ -145,14 +145,14 @@ def _box_problem(system: Model, ranges: Sequence[Range]) -> _BoxProblem:
     # The reference point is inside the box, as a link may have loss probability 0 at an end. It is shifted in
     # each range, because probabilities that add up to exactly 1 are those of bursts.
     reference = [interval.low + (interval.high - interval.low) / 3 for interval in ranges]
-    _refuse_range(numeric.at(_model_at_point(system, ranges, reference)), ranges[0])
+    _refuse_range(numeric.at(_model_at_point(model, ranges, reference)), ranges[0])
     for index, interval in enumerate(ranges):
         point = [
             *reference[:index],
             interval.high - (interval.high - interval.low) / 3,
             *reference[index + 1 :],
         ]
-        _refuse_range(numeric.at(_model_at_point(system, ranges, point)), interval)
+        _refuse_range(numeric.at(_model_at_point(model, ranges, point)), interval)
     parametric = parametric_subsystems(numeric, [ranges[index] for index in peer_ranges], lifted)
     reception = build_reception(numeric.at(parametric.at))
     subsystems = tuple(parametric.subsystems[group.name] for group in reception.groups)
@@ -176,34 +176,34 @@ def _box_problem(system: Model, ranges: Sequence[Range]) -> _BoxProblem:
 
 def _refuse_range(numeric: NumericModel, interval: Range) -> None:
     """Raise ApcError E898 for a network or a range for which no box is proved."""
-    system = numeric.model
+    model = numeric.model
     message = ""
-    for _, law in unreliable(system):
+    for _, law in unreliable(model):
         if law.trace is not None:
             message = f"recorded delays of {law.label}"
         elif not is_memoryless(law):
             message = f"bursts of {law.label}"
         elif law.mean_loss and law.zero:
             message = f"losses of {law.label} with on_loss: zero"
-    losses = [channel.loss for link in system.links for channel in link.channels if channel.loss]
+    losses = [channel.loss for link in model.links for channel in link.channels if channel.loss]
     shares = {name for loss in losses for name in (loss.p, loss.r, loss.one_minus_h, loss.one_minus_k)}
-    if interval.free.name in channel_numbers(system) - shares:
+    if interval.free.name in channel_numbers(model) - shares:
         message = f"{interval.free.label}, which determines other parameters of a link"
     why = "" if message else mean_square_growth(numeric, bounded=False).why
     if message or why:
         text = f"no box is proved in mean square over {message}" if message else f"no box is proved: {why}"
         fix = f"apc critical {interval.free.label} --criterion {'nominal' if why else 'mean-square'}"
-        if why and interval.free.name in channel_numbers(system):
+        if why and interval.free.name in channel_numbers(model):
             fix = "apc simulate"
         raise ApcError(Diagnostic("E898", LOCATION, text, fix=fix))
 
 
 def _model_at_point(
-    system: Model, ranges: Sequence[Range], point: Sequence[Fraction], indices: Sequence[int] = ()
+    model: Model, ranges: Sequence[Range], point: Sequence[Fraction], indices: Sequence[int] = ()
 ) -> Model:
     """Return the model at a point of the box, with all ranges or some set."""
     chosen = indices or range(len(ranges))
-    return apply(system, [Override(ranges[index].free, point[index]) for index in chosen])
+    return apply(model, [Override(ranges[index].free, point[index]) for index in chosen])
 
 
 def _is_unstable(problem: _BoxProblem, point: Sequence[Fraction]) -> bool:
@@ -255,9 +255,9 @@ def _memories(problem: _BoxProblem, cell: Cell) -> Sequence[RouteMemory]:
     shares = [index for index in range(len(cell)) if index not in problem.local]
     if not shares:
         return problem.memories
-    system = _model_at_point(problem.numeric.model, problem.ranges, middle(cell), shares)
+    model = _model_at_point(problem.numeric.model, problem.ranges, middle(cell), shares)
     changes = _loss_changes(problem, cell, shares)
-    return stored_of(system, problem.classes.reception, problem.wide, lost=changes)
+    return stored_of(model, problem.classes.reception, problem.wide, lost=changes)
 
 
 def _loss_changes(problem: _BoxProblem, cell: Cell, shares: Sequence[int]) -> dict[Route, tuple[float, ...]]:

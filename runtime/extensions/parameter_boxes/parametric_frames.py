@@ -102,24 +102,24 @@ def parametric_subsystems(
     ApcError
         E831 a parameter given twice, E832 a model that is no rational function of the parameters.
     """
-    system = numeric.model
+    model = numeric.model
     for index, interval in enumerate(ranges):
-        if any(overlap(system, earlier.free, interval.free) for earlier in ranges[:index]):
+        if any(overlap(model, earlier.free, interval.free) for earlier in ranges[:index]):
             raise ApcError(Diagnostic("E831", LOCATION, f"{interval.free.label} has two ranges in one box"))
     if not all(subsystem.parameters_suffice for subsystem in numeric.jacobians):
-        message = f"{system.name} is nonlinear; the point of linearization may depend on the parameters"
-        raise ApcError(Diagnostic("E832", SourceLocation(system.origin.topology), message))
+        message = f"{model.name} is nonlinear; the point of linearization may depend on the parameters"
+        raise ApcError(Diagnostic("E832", SourceLocation(model.origin.topology), message))
     field = Ratios.of(len(ranges))
-    symbolic_parameters = [_dependent_parameters(system, group, ranges, field) for group in system.groups]
+    symbolic_parameters = [_dependent_parameters(model, group, ranges, field) for group in model.groups]
     point = [
         Override(interval.free, interval.low + GENERIC**index * (interval.high - interval.low))
         for index, interval in enumerate(ranges, 1)
     ]
-    at = apply(system, point)
+    at = apply(model, point)
     groups, exchange = lifted(at)
     subsystems = {
         group.name: _parametric_subsystem(
-            group, symbolic_parameters[exchange.group_of(group.peers.first)], system
+            group, symbolic_parameters[exchange.group_of(group.peers.first)], model
         )
         for group in groups
     }
@@ -127,11 +127,11 @@ def parametric_subsystems(
 
 
 def _dependent_parameters(
-    system: Model, group: Group, ranges: Sequence[Range], field: Ratios
+    model: Model, group: Group, ranges: Sequence[Range], field: Ratios
 ) -> dict[str, Ratio]:
     """Return a group's parameters that depend on those of the box, by name, as quotients of polynomials."""
     columns = {column.name for column in group.columns}
-    scope = scope_of(system, group.values, fixed=columns)
+    scope = scope_of(model, group.values, fixed=columns)
     varying = scope.follow(dict.fromkeys(columns, True), lambda *_: True, lambda _: False)
     given = {
         interval.free.name: field.parameter(index)
@@ -155,7 +155,7 @@ def _dependent_parameters(
             message = f"{name} = {formula.text[:60]} {reason}"
             raise ApcError(Diagnostic("E832", LOCATION, message)) from None
 
-    names_of_type = system.peer_types[group.peer_type].parameters
+    names_of_type = model.peer_types[group.peer_type].parameters
     result = scope.follow(given, compute, lambda name: Fraction(scope.holder[name].value), names_of_type)
     return {name: result[name] for name in names_of_type if isinstance(result.get(name), Ratio)}
 
@@ -187,7 +187,7 @@ _RULES: dict[str, Callable[..., Any]] = {
 }
 
 
-def _parametric_subsystem(group: PeerClass, symbolic: Mapping[str, Ratio], system: Model) -> LinearSubsystem:
+def _parametric_subsystem(group: PeerClass, symbolic: Mapping[str, Ratio], model: Model) -> LinearSubsystem:
     """Return the matrices of a class of peers with the parameters of the box as symbols."""
     peer_type = group.jacobians.peer_type
     numbers = zip(peer_type.parameters, group.exact_parameters, strict=True)
@@ -196,4 +196,4 @@ def _parametric_subsystem(group: PeerClass, symbolic: Mapping[str, Ratio], syste
         return parametric_subsystem(group.jacobians, vector)
     except NotRational as reason:
         message = f"an equation of {group.name} {reason}"
-        raise ApcError(Diagnostic("E832", SourceLocation(system.origin.topology), message)) from None
+        raise ApcError(Diagnostic("E832", SourceLocation(model.origin.topology), message)) from None

@@ -73,13 +73,13 @@ CellTest = Callable[[Sequence[Cell]], Iterator[CellVerdict]]
 
 @part("box")
 def prove_robust_stability(
-    system: Model, ranges: Sequence[Range], *, cells: int | None = None, inside: float = 1.0
+    model: Model, ranges: Sequence[Range], *, cells: int | None = None, inside: float = 1.0
 ) -> RobustStability:
     """Return a proof that a model is stable in a complete box, or a point of the box where it is unstable.
 
     Parameters
     ----------
-    system
+    model
         The compiled model.
     ranges
         The ranges of parameters, see `parametric_frames.parse_range`.
@@ -95,7 +95,7 @@ def prove_robust_stability(
         box.
     """
     with single_threaded(), np.errstate(all="ignore"):
-        numeric = numeric_model(system)
+        numeric = numeric_model(model)
         problem = box_problem(numeric, ranges, inside)
 
         def is_unstable(point: Sequence[Fraction]) -> bool:
@@ -103,14 +103,14 @@ def prove_robust_stability(
             the box.
             """
             values = [Override(interval.free, value) for interval, value in zip(ranges, point, strict=True)]
-            analysis = analyze(numeric.at(apply(system, values)))
+            analysis = analyze(numeric.at(apply(model, values)))
             return (
                 analysis.verdict is StabilityVerdict.UNSTABLE
                 or analysis.spectral_radius - analysis.spectral_radius_error > inside
             )
 
         box_proof = search_box(
-            system.name,
+            model.name,
             ranges,
             partial(_test_cells, problem.questions, is_unstable),
             is_unstable,

@@ -146,7 +146,7 @@ class ParameterFit(Result):
         return self._plotted(ax, style=style)
 
 
-def read_free(system: Model, given: Sequence[str | NamedValues]) -> tuple[Range, ...]:
+def read_free(model: Model, given: Sequence[str | NamedValues]) -> tuple[Range, ...]:
     """Return the free parameters of texts `NAME=LOW:HIGH`, or of names with the two ends.
 
     Raises
@@ -156,17 +156,17 @@ def read_free(system: Model, given: Sequence[str | NamedValues]) -> tuple[Range,
         the errors of `parse_range`.
     """
     if not given:
-        message, fix = "no free parameter", f'--free "{proposed_range(system)}"'
+        message, fix = "no free parameter", f'--free "{proposed_range(model)}"'
         raise ApcError(Diagnostic("E714", FREE, message, fix=fix))
     free: list[Range] = []
     for named in given:
         name = named_values(named)[0]
-        if name and is_delay(system, find(system, name, FREE)):
+        if name and is_delay(model, find(model, name, FREE)):
             message = f"{name} is a delay: the order of events changes with it"
             raise ApcError(Diagnostic("E714", FREE, message, advice="fit it to packets with apc network"))
-        item = parse_range(system, named, FREE)
-        label, value = item.free.label, value_now(system, item.free)
-        if any(overlap(system, item.free, other.free) for other in free):
+        item = parse_range(model, named, FREE)
+        label, value = item.free.label, value_now(model, item.free)
+        if any(overlap(model, item.free, other.free) for other in free):
             raise ApcError(Diagnostic("E714", FREE, f"{label} has two ranges"))
         if not item.low <= value <= item.high:
             low, high, now, middle = (
@@ -180,7 +180,7 @@ def read_free(system: Model, given: Sequence[str | NamedValues]) -> tuple[Range,
 
 
 def fit(
-    system: Model,
+    model: Model,
     recording: Path,
     free: Sequence[Range],
     *,
@@ -191,7 +191,7 @@ def fit(
 
     Parameters
     ----------
-    system
+    model
         The model; its parameter values are the start of the search.
     recording
         A table of force and motion (see `measured_columns`), or the folder of a run.
@@ -209,23 +209,23 @@ def fit(
         parameter, E716 the search fails; and those of `simulate`.
     """
     if recording.is_dir():
-        recorded = signals_of_run(system, read_run(recording), signals)
+        recorded = signals_of_run(model, read_run(recording), signals)
     else:
-        for _, law in unreliable(system):
+        for _, law in unreliable(model):
             if law.trace is None:
                 message = f"{chance(law)}: a table does not contain the packets that arrived"
-                location, fix = SourceLocation(system.origin.topology), f"apc run {system.origin.topology}"
+                location, fix = SourceLocation(model.origin.topology), f"apc run {model.origin.topology}"
                 raise ApcError(Diagnostic("E713", location, message, fix=fix))
-        recorded = recorded_signals(system, read_recording(recording), signals)
+        recorded = recorded_signals(model, read_recording(recording), signals)
     settings = Settings(recorded.duration, method, jit=recorded.run is None)
-    return _solve(_problem_of(system, recorded, str(recording), free, settings))
+    return _solve(_problem_of(model, recorded, str(recording), free, settings))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Problem:
     """A least-squares problem over shares of the ranges, from 0 to 1.
 
-    `system` has the sensitivities; `start` (k,) are the shares of its present values. `rows` are the
+    `model` has the sensitivities; `start` (k,) are the shares of its present values. `rows` are the
     simulated rows at recorded instants, `time` (samples,) and `measured` (samples, signals) the values there.
     `scale` (signals,) is the spread of each signal.
     """
@@ -235,7 +235,7 @@ class _Problem:
     recorded: RecordedSignals
     free: Sequence[Range]
     settings: Settings
-    system: Model
+    model: Model
     start: Floats
     rows: Integers
     time: Floats
@@ -249,11 +249,11 @@ class _Problem:
 
 
 def _problem_of(
-    system: Model, recorded: RecordedSignals, file: str, free: Sequence[Range], settings: Settings
+    model: Model, recorded: RecordedSignals, file: str, free: Sequence[Range], settings: Settings
 ) -> _Problem:
     """Return the least-squares problem of a recording. Raises ApcError E712 for a short recording."""
-    check_length(recorded.system, recorded.duration)
-    simulation = prepare(recorded.system, Settings(recorded.duration, jit=False))
+    check_length(recorded.model, recorded.duration)
+    simulation = prepare(recorded.model, Settings(recorded.duration, jit=False))
     last = int(recorded.duration / simulation.quantum)
     instants, is_row = instants_of(simulation, 0, last // simulation.frame + 1, last)
     ticks, tolerance = instants[is_row] * float(simulation.quantum), AT_END * float(simulation.quantum)
@@ -274,14 +274,14 @@ def _problem_of(
             raise ApcError(Diagnostic("E712", SourceLocation(file), message, expected, got, advice=advice))
     spread = np.maximum(measured.std(axis=0), EXACT * np.abs(measured).max(axis=0))
     return _Problem(
-        topology=system.name,
+        topology=model.name,
         file=file,
         recorded=recorded,
         free=free,
         settings=settings,
-        system=with_sensitivities(recorded.system, free),
+        model=with_sensitivities(recorded.model, free),
         start=np.array(
-            [(value_now(system, one.free) - float(one.low)) / float(one.high - one.low) for one in free]
+            [(value_now(model, one.free) - float(one.low)) / float(one.high - one.low) for one in free]
         ).clip(0, 1),
         rows=rows,
         time=recorded.times[indices[rows]],
@@ -306,8 +306,8 @@ def _simulate(problem: _Problem, shares: Floats) -> Floats:
         for signal in recorded.signals
         for k in range(len(shares) + 1)
     ]
-    system = with_values(problem.system, problem.free, problem.values(shares))
-    simulation, run, player = prepare(system, problem.settings, signals=names), recorded.run, None
+    model = with_values(problem.model, problem.free, problem.values(shares))
+    simulation, run, player = prepare(model, problem.settings, signals=names), recorded.run, None
     if run is not None:
         population = simulation.population
         player = InterpretedEngine(population, lambda _: DeliveredRun(run, population))

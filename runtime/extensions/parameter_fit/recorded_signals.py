@@ -48,7 +48,7 @@ class RecordedSignals:
     time of the first row in seconds.
     """
 
-    system: Model
+    model: Model
     times: Floats
     duration: Fraction
     signals: tuple[Signal, ...]
@@ -78,12 +78,12 @@ class _Target:
         return f"{self.group}[{self.peer}].{self.local}", f"{self.group}.{self.local}", self.local
 
 
-def recorded_signals(system: Model, table: MeasuredTable, patterns: Sequence[str] = ()) -> RecordedSignals:
+def recorded_signals(model: Model, table: MeasuredTable, patterns: Sequence[str] = ()) -> RecordedSignals:
     """Return the measured signals of a recording, and the model with its forces.
 
     Parameters
     ----------
-    system
+    model
         The model.
     table
         The recording. A column is named by a signal of `simulate`, by a hand with a constant force, which it
@@ -96,15 +96,15 @@ def recorded_signals(system: Model, table: MeasuredTable, patterns: Sequence[str
     ApcError
         E711 a column is unknown, ambiguous or has another unit; no column is measured.
     """
-    refuse_joins_and_leaves(system, "apc fit")
-    if not system.clocks:  # rows at the instants of the recording
+    refuse_joins_and_leaves(model, "apc fit")
+    if not model.clocks:  # rows at the instants of the recording
         names = f"{CLOCK} period", f"{CLOCK} phase"
         times = Timing(names[0], table.interval), Timing(names[1], Fraction(0))
-        system = replace(system, clocks=(Clock(CLOCK, *names),), timings=(*system.timings, *times))
-    signals = prepare(system, Settings(table.interval, jit=False)).signals
+        model = replace(model, clocks=(Clock(CLOCK, *names),), timings=(*model.timings, *times))
+    signals = prepare(model, Settings(table.interval, jit=False)).signals
     measurable = [_Target(one.group, one.peer, one.local, one.unit, one) for one in signals]
     known: dict[str, dict[_Target, None]] = {}
-    for target in (*measurable, *_force_targets(system)):
+    for target in (*measurable, *_force_targets(model)):
         for name in target.names:
             known.setdefault(name, {})[target] = None
     columns: dict[_Target, MeasuredColumn] = {}
@@ -126,7 +126,7 @@ def recorded_signals(system: Model, table: MeasuredTable, patterns: Sequence[str
     used = {one.signal: column.numbers for one, column in columns.items() if one.signal}
     forces = {one: column.numbers for one, column in columns.items() if not one.signal}
     recorded = RecordedSignals(
-        system=_with_forces(system, forces, table.times) if forces else system,
+        model=_with_forces(model, forces, table.times) if forces else model,
         times=table.times,
         duration=table.interval * (len(table.times) - 1),
         signals=tuple(used),
@@ -137,12 +137,12 @@ def recorded_signals(system: Model, table: MeasuredTable, patterns: Sequence[str
     return _selected(recorded, patterns, table.file, signals[0])
 
 
-def signals_of_run(system: Model, run: RealtimeRun, patterns: Sequence[str] = ()) -> RecordedSignals:
+def signals_of_run(model: Model, run: RealtimeRun, patterns: Sequence[str] = ()) -> RecordedSignals:
     """Return the recorded signals of all peers of a run, and the model with the network of the run.
 
     Parameters
     ----------
-    system
+    model
         The model.
     run
         The run.
@@ -154,7 +154,7 @@ def signals_of_run(system: Model, run: RealtimeRun, patterns: Sequence[str] = ()
     ApcError
         E713 the run is of another topology, or can't be simulated.
     """
-    live = live_topology(system)
+    live = live_topology(model)
     signals = {one.name: one for one in prepare(live, Settings(Fraction(1, 1000), jit=False)).signals}
     rows = min(len(peer.time) for peer in run.peers)
     columns = {
@@ -162,14 +162,14 @@ def signals_of_run(system: Model, run: RealtimeRun, patterns: Sequence[str] = ()
         for peer in run.peers
         for name, column in zip(peer.signals, peer.values[:rows].T, strict=True)
     }
-    reason = reason_not_simulated(run.system, run.peers)
-    if not reason and (system.timings != run.system.timings or {*columns} != {*signals}):
-        reason = f"it is of another topology than {system.name}"
+    reason = reason_not_simulated(run.model, run.peers)
+    if not reason and (model.timings != run.model.timings or {*columns} != {*signals}):
+        reason = f"it is of another topology than {model.name}"
     if reason:
         message, advice = f"the run can't be repeated: {reason}", "use a table of force and motion"
         raise ApcError(Diagnostic("E713", SourceLocation(run.folder), message, advice=advice))
     recorded = RecordedSignals(
-        system=live,
+        model=live,
         times=run.peers[0].time[:rows],
         duration=Fraction(float(run.peers[0].time[rows - 1])).limit_denominator(10**6),
         signals=tuple(signals.values()),
@@ -184,7 +184,7 @@ def _selected(
 ) -> RecordedSignals:
     """Return a recording with the signals that match a pattern. Raises ApcError E711 if none does."""
     settings = Settings(recorded.duration, jit=False)
-    matching = {*prepare(recorded.system, settings, signals=patterns).signals}
+    matching = {*prepare(recorded.model, settings, signals=patterns).signals}
     chosen = [index for index, signal in enumerate(recorded.signals) if signal in matching]
     if not chosen:
         got = "only forces" if recorded.forces and not recorded.signals else "none"
@@ -193,11 +193,11 @@ def _selected(
     return replace(recorded, signals=signals, values=recorded.values[:, chosen])
 
 
-def _force_targets(system: Model) -> Iterator[_Target]:
+def _force_targets(model: Model) -> Iterator[_Target]:
     """Yield the forces that can be recorded: constant forces of hands, and forces on parts."""
-    units = {parameter.name: parameter.unit for parameter in system.parameters}
-    for group in system.groups:
-        peer_type = system.peer_types[group.peer_type]
+    units = {parameter.name: parameter.unit for parameter in model.parameters}
+    for group in model.groups:
+        peer_type = model.peer_types[group.peer_type]
         names = [
             (name.replace(FORCE, ""), name)
             for index, name in enumerate(peer_type.parameters)
@@ -222,20 +222,20 @@ def _is_constant_force(peer_type: PeerType, index: int) -> bool:
     return bool(effect.nnz()) and not casadi.depends_on(effect, casadi.vertcat(x, u, p[index], t))
 
 
-def _with_forces(system: Model, forces: dict[_Target, Floats], times: Floats) -> Model:
+def _with_forces(model: Model, forces: dict[_Target, Floats], times: Floats) -> Model:
     """Return a model with recorded forces, linear between their rows.
 
     A force acts on its peer: its share, a parameter, is 1 there and 0 at other peers of the same type.
     """
-    unit_of = {parameter.name: parameter.unit for parameter in system.parameters}
-    numbers, direct = resolve(system), coupled_directly(system.peer_types)
-    peer_types, groups, shares = list(system.peer_types), list(system.groups), list[Parameter]()
+    unit_of = {parameter.name: parameter.unit for parameter in model.parameters}
+    numbers, direct = resolve(model), coupled_directly(model.peer_types)
+    peer_types, groups, shares = list(model.peer_types), list(model.groups), list[Parameter]()
     for target, force in forces.items():
         index = next(index for index, group in enumerate(groups) if group.name == target.group)
         group, effect = groups[index], None
         if not target.parameter:
             vector = numbers.parameters[index][numbers.rows[index][target.peer - 1]]
-            subsystem = jacobians(system.peer_types[group.peer_type])
+            subsystem = jacobians(model.peer_types[group.peer_type])
             effect = find_devices(subsystem, vector, unit_of, part=target.local, direct=direct).get(
                 target.local
             )
@@ -244,7 +244,7 @@ def _with_forces(system: Model, forces: dict[_Target, Floats], times: Floats) ->
                     f"force on {target.local}: {effect or 'its mass does not follow from its equations'}"
                 )
                 fix = f"hands: {{hand: {{type: ConstantForce, flange: {target.local}, force: 0 N}}}}"
-                raise ApcError(Diagnostic("E711", SourceLocation(system.origin.topology), message, fix=fix))
+                raise ApcError(Diagnostic("E711", SourceLocation(model.origin.topology), message, fix=fix))
         share = Parameter(f"share of {target.names[0]}", "1", 0.0)
         shares.append(share)
         table = function_of(Interpolation(times, force))
@@ -254,10 +254,10 @@ def _with_forces(system: Model, forces: dict[_Target, Floats], times: Floats) ->
         column = PeerColumn(share.name, np.eye(group.count)[target.peer - 1])
         groups[index] = replace(group, columns=(*group.columns, column))
     return replace(
-        system,
+        model,
         peer_types=tuple(peer_types),
         groups=tuple(groups),
-        parameters=(*system.parameters, *shares),
+        parameters=(*model.parameters, *shares),
     )
 
 

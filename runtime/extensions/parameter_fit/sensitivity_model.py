@@ -41,15 +41,15 @@ def name_of(index: int, name: str) -> str:
     return f"d{index} {name}" if index else name
 
 
-def with_values(system: Model, free: Sequence[Range], values: Floats) -> Model:
+def with_values(model: Model, free: Sequence[Range], values: Floats) -> Model:
     """Return a model with values (k,) of its free parameters in SI, and the derivatives at these values."""
     pairs = zip(free, values.tolist(), strict=True)
     return _with_derivatives(
-        apply(system, [Override(one.free, Fraction(value)) for one, value in pairs]), free
+        apply(model, [Override(one.free, Fraction(value)) for one, value in pairs]), free
     )
 
 
-def with_sensitivities(system: Model, free: Sequence[Range]) -> Model:
+def with_sensitivities(model: Model, free: Sequence[Range]) -> Model:
     """Return a model with the derivatives of its signals over free parameters, each times its range's width.
 
     The signal `d1 device.x` is the derivative of `device.x` over the first free parameter.
@@ -60,41 +60,39 @@ def with_sensitivities(system: Model, free: Sequence[Range]) -> Model:
         E713 a maximum or minimum over other peers.
     """
     orders = range(len(free) + 1)
-    channels = {send.link: len(send.channels) for peer_type in system.peer_types for send in peer_type.sends}
-    used = {name for peer_type in system.peer_types for name in peer_type.parameters}
+    channels = {send.link: len(send.channels) for peer_type in model.peer_types for send in peer_type.sends}
+    used = {name for peer_type in model.peer_types for name in peer_type.parameters}
     parameters = (
         Parameter(name_of(k, parameter.name), parameter.unit, 0.0)
         for k in orders[1:]
-        for parameter in system.parameters
+        for parameter in model.parameters
         if parameter.name in used
     )
     extended = replace(
-        system,
-        peer_types=tuple(_Extension(one, orders, channels).peer_type for one in system.peer_types),
-        parameters=(*system.parameters, *parameters),
+        model,
+        peer_types=tuple(_Extension(one, orders, channels).peer_type for one in model.peer_types),
+        parameters=(*model.parameters, *parameters),
     )
     return _with_derivatives(extended, free)
 
 
-def _with_derivatives(system: Model, free: Sequence[Range]) -> Model:
+def _with_derivatives(model: Model, free: Sequence[Range]) -> Model:
     """Return a model with sensitivities, with the derivatives of its parameters at their present values."""
-    return replace(
-        system, groups=tuple(_group_with_derivatives(system, group, free) for group in system.groups)
-    )
+    return replace(model, groups=tuple(_group_with_derivatives(model, group, free) for group in model.groups))
 
 
-def _group_with_derivatives(system: Model, group: Group, free: Sequence[Range]) -> Group:
+def _group_with_derivatives(model: Model, group: Group, free: Sequence[Range]) -> Group:
     """Return a group of a model with sensitivities, with the derivatives of its parameters."""
     names, parameters = (
-        system.peer_types[group.peer_type].parameters,
-        {one.name: one for one in system.parameters},
+        model.peer_types[group.peer_type].parameters,
+        {one.name: one for one in model.parameters},
     )
     count = len(names) // (len(free) + 1)
     values, columns = {one.name: one for one in group.values}, {one.name: one for one in group.columns}
     for k, item in enumerate(free, 1):
-        step = {item.free: np.array([value_now(system, item.free) + 1j * STEP])}
+        step = {item.free: np.array([value_now(model, item.free) + 1j * STEP])}
         peers = range(group.count if group.columns else 1)
-        rows = np.concatenate([free_rows(system, group, peer, step) for peer in peers])[:, :count]
+        rows = np.concatenate([free_rows(model, group, peer, step) for peer in peers])[:, :count]
         numbers = np.imag(rows) / STEP * float(item.high - item.low)
         for name, column in zip(names[:count], numbers.T, strict=True):
             values[name_of(k, name)] = replace(parameters[name_of(k, name)], value=float(column[0]))

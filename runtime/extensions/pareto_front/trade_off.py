@@ -72,7 +72,7 @@ class ParetoFront(Result):
 
 
 def pareto_front(
-    system: Model,
+    model: Model,
     spec: TuningSpec,
     tradeoff: TransparencyMetric,
     *,
@@ -84,7 +84,7 @@ def pareto_front(
 
     Parameters
     ----------
-    system, spec
+    model, spec
         As for `tune`.
     tradeoff
         The transparency metric; its `most` is ignored.
@@ -99,7 +99,7 @@ def pareto_front(
         E996 the metric is smallest at the best objective.
     """
     until = time.monotonic() + seconds
-    constraints = ConstraintSet(numeric_model(system), replace(spec, transparency_metrics=(tradeoff,)))
+    constraints = ConstraintSet(numeric_model(model), replace(spec, transparency_metrics=(tradeoff,)))
     scenarios = constraints.every()
 
     def transparency(gains: Floats) -> float:
@@ -107,12 +107,12 @@ def pareto_front(
         points = ((scenario.setting, np.append(gains, scenario.point)[None]) for scenario in scenarios)
         return max(float(constraints.measured(*point, constraints.spec)[0, 0, 0]) for point in points)
 
-    best = tune(system, spec, seconds=seconds, progress=progress)
+    best = tune(model, spec, seconds=seconds, progress=progress)
     metric_objective = Objective(
         tradeoff.label, len(spec.free), False, TRANSPARENCY[tradeoff.name][0], ((1.0, tradeoff),)
     )
     lowest_metric = tune(
-        system, replace(spec, objective=metric_objective), seconds=until - time.monotonic(), progress=progress
+        model, replace(spec, objective=metric_objective), seconds=until - time.monotonic(), progress=progress
     )
     least_metric, largest_metric = (
         lowest_metric.optimum,
@@ -141,14 +141,14 @@ def pareto_front(
         bounded_spec = replace(
             spec, transparency_metrics=(*spec.transparency_metrics, replace(tradeoff, most=bound))
         )
-        tuning = tune(system, bounded_spec, seconds=remaining, progress=progress)
+        tuning = tune(model, bounded_spec, seconds=remaining, progress=progress)
         if tuning.feasible:
             designs.append(
                 _design(tuning, transparency(np.array([float(gain.value) for gain in tuning.gains])))
             )
     designs.sort(key=lambda design: design.transparency)
     return ParetoFront(
-        topology=system.name,
+        topology=model.name,
         objective=spec.objective.label,
         unit=best.unit,
         maximize=spec.objective.maximize,

@@ -79,27 +79,27 @@ def arbitrary_switching(
     modes
         Its contact modes.
     """
-    system = numeric.model
-    if any(link.channel is not None for link in system.links):
+    model = numeric.model
+    if any(link.channel is not None for link in model.links):
         return ArbitrarySwitching(
-            system.name,
+            model.name,
             SwitchingVerdict.OPEN,
             "the criterion is available for the nominal network only",
         )
     if modes.unstable:
         named = " or ".join(modes.unstable)
         when = "in any mode" if len(modes.unstable) == len(modes.modes) else f"when {named}"
-        return ArbitrarySwitching(system.name, SwitchingVerdict.CANNOT, f"it is not stable {when}")
+        return ArbitrarySwitching(model.name, SwitchingVerdict.CANNOT, f"it is not stable {when}")
     unknown = [mode.name for mode in modes.modes if mode.stable is None or mode.linearized]
     if unknown or modes.notes:
         reason = f"not known when {' or '.join(unknown)}" if unknown else modes.notes[0]
-        return ArbitrarySwitching(system.name, SwitchingVerdict.OPEN, reason)
+        return ArbitrarySwitching(model.name, SwitchingVerdict.OPEN, reason)
     try:
-        return _common_lyapunov(system.name, lure_plants(numeric))
+        return _common_lyapunov(model.name, lure_plants(numeric))
     except NotSupportedError as why:
-        return ArbitrarySwitching(system.name, SwitchingVerdict.OPEN, str(why))
+        return ArbitrarySwitching(model.name, SwitchingVerdict.OPEN, str(why))
     except ApcError as error:
-        return ArbitrarySwitching(system.name, SwitchingVerdict.OPEN, error.mistakes[0].sentence)
+        return ArbitrarySwitching(model.name, SwitchingVerdict.OPEN, error.mistakes[0].sentence)
 
 
 def _common_lyapunov(topology: str, loops: Sequence[LurePlant]) -> ArbitrarySwitching:

@@ -72,12 +72,12 @@ def load_of(bias: float) -> float:
     return (math.sqrt(1 - bias * bias) + bias * (math.pi / 2 + math.asin(bias))) / math.pi
 
 
-def predict(system: Model, groups: list[tuple[PeerClass, tuple[SectorNonlinearity, ...]]]) -> Predicted:
+def predict(model: Model, groups: list[tuple[PeerClass, tuple[SectorNonlinearity, ...]]]) -> Predicted:
     """Return the limit cycle of a model that the describing function predicts.
 
     Parameters
     ----------
-    system
+    model
         The compiled model.
     groups
         From `lure_form.contact_groups`.
@@ -87,7 +87,7 @@ def predict(system: Model, groups: list[tuple[PeerClass, tuple[SectorNonlinearit
     NotSupportedError
         The reason why no limit cycle is predicted.
     """
-    exchange = build_exchange(system, resolve(system).timings)
+    exchange = build_exchange(model, resolve(model).timings)
 
     def spectrum_at(gain: float) -> Spectrum:
         """Return the spectrum of the loop with linear contacts of this share of their stiffness."""

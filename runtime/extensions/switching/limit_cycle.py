@@ -140,55 +140,55 @@ def limit_cycle(
     ApcError
         E864 no one-sided contact at ticks; and the errors of `trajectory.simulate`.
     """
-    system = numeric.model
+    model = numeric.model
     try:
         groups = contact_groups(numeric)
     except NotSupportedError as why:
-        raise _no_limit_cycle(system, str(why)) from None
+        raise _no_limit_cycle(model, str(why)) from None
     if not any(forces for _, forces in groups):
-        raise _no_limit_cycle(system, "no contact is closed")
+        raise _no_limit_cycle(model, "no contact is closed")
     for _, forces in groups:
         for push in forces:
             if not push.unilateral:
-                raise _no_limit_cycle(system, f"{push.part} also pulls, or is limited")
-    contacts = _contacts(system, groups)
+                raise _no_limit_cycle(model, f"{push.part} also pulls, or is limited")
+    contacts = _contacts(model, groups)
     predicted, reason = None, ""
     try:
-        predicted = predict(system, groups)
+        predicted = predict(model, groups)
     except NotSupportedError as why:
         reason = str(why)
-    seconds = _duration(system)
+    seconds = _duration(model)
     names = [contact.name for contact in contacts] + [
         state for contact in contacts for state in contact.states
     ]
-    simulated = simulate(system, duration=seconds, signals=tuple(dict.fromkeys(names)))
-    result = _comparison(system.name, predicted, reason, simulated, contacts)
-    if all(link.channel is None for link in system.links):
+    simulated = simulate(model, duration=seconds, signals=tuple(dict.fromkeys(names)))
+    result = _comparison(model.name, predicted, reason, simulated, contacts)
+    if all(link.channel is None for link in model.links):
         return result
     return replace(result, notes=(*result.notes, BY_CHANCE))
 
 
-def _duration(system: Model) -> Fraction:
+def _duration(model: Model) -> Fraction:
     """Return the simulated duration in whole seconds: `LONGEST`, or less for many peers."""
-    timings = {timing.name: timing.value for timing in system.timings}
-    tick = min(timings[clock.period] for clock in system.clocks)
-    most = math.floor(MOST_SIMULATED * tick / system.peers)
+    timings = {timing.name: timing.value for timing in model.timings}
+    tick = min(timings[clock.period] for clock in model.clocks)
+    most = math.floor(MOST_SIMULATED * tick / model.peers)
     if most < SHORTEST:
-        raise _no_limit_cycle(system, f"{system.peers:,} peers are too many to simulate for {SHORTEST} s")
+        raise _no_limit_cycle(model, f"{model.peers:,} peers are too many to simulate for {SHORTEST} s")
     return Fraction(min(most, LONGEST))
 
 
-def _no_limit_cycle(system: Model, why: str) -> ApcError:
+def _no_limit_cycle(model: Model, why: str) -> ApcError:
     """Return the error E864 with the reason why no limit cycle is predicted."""
     message = f"no limit cycle is predicted: {why}"
-    return ApcError(Diagnostic("E864", SourceLocation(system.origin.topology), message, fix="apc simulate"))
+    return ApcError(Diagnostic("E864", SourceLocation(model.origin.topology), message, fix="apc simulate"))
 
 
 def _contacts(
-    system: Model, groups: Sequence[tuple[PeerClass, tuple[SectorNonlinearity, ...]]]
+    model: Model, groups: Sequence[tuple[PeerClass, tuple[SectorNonlinearity, ...]]]
 ) -> list[_RecordedContact]:
     """Return the contacts to record: those of the first peers of each group."""
-    exchange = build_exchange(system, resolve(system).timings)
+    exchange = build_exchange(model, resolve(model).timings)
     peers_per_group = max(1, MOST_PEERS // len(groups))
     result = []
     for group, forces in groups:
@@ -198,9 +198,7 @@ def _contacts(
                 states = group.jacobians.peer_type.states
                 indices = [k for k, state in enumerate(states) if state.unit == LENGTH and push.slopes[k]]
                 if push.slopes[push.states :].any() or not indices:
-                    raise _no_limit_cycle(
-                        system, f"{push.part} depends on more than positions and velocities"
-                    )
+                    raise _no_limit_cycle(model, f"{push.part} depends on more than positions and velocities")
                 stiffness = float(np.abs(push.slopes[indices]).max())
                 result.append(
                     _RecordedContact(

@@ -112,7 +112,7 @@ def contact_groups(numeric: NumericModel) -> list[tuple[PeerClass, tuple[SectorN
     NotSupportedError
         The reason why the Lur'e form does not exist.
     """
-    system = numeric.model
+    model = numeric.model
     numbers = numeric.numbers
     current_peer_types = [subsystem.peer_type for subsystem in numeric.jacobians]
     if any(partition.variants for peer_type in current_peer_types for partition in peer_type.clocks):
@@ -120,7 +120,7 @@ def contact_groups(numeric: NumericModel) -> list[tuple[PeerClass, tuple[SectorN
             "values computed from received packets depend on their age, which varies between ticks"
         )
     switched = [find_switches(peer_type) for peer_type in current_peer_types]
-    parts = parts_of_peer_types(system, switched, numbers)
+    parts = parts_of_peer_types(model, switched, numbers)
     on = tuple(
         bind(switched_peer_type, subsystem, settings(parts_of_type, on=True))
         if switched_peer_type.decisions
@@ -129,7 +129,7 @@ def contact_groups(numeric: NumericModel) -> list[tuple[PeerClass, tuple[SectorN
             switched, numeric.jacobians, parts, strict=True
         )
     )
-    for index, group in enumerate(system.groups):
+    for index, group in enumerate(model.groups):
         parameter_vector = numbers.parameters[index][0]
         for part in parts[group.peer_type]:
             contact_force(
@@ -139,7 +139,7 @@ def contact_groups(numeric: NumericModel) -> list[tuple[PeerClass, tuple[SectorN
             raise NotSupportedError(f"a force at {group.name} is nonlinear or depends on individual senders")
     pairs = []
     for peers in classes_of_peers(numeric.with_jacobians(on)):
-        type_index = system.groups[numeric.exchange.group_of(peers.peers.first)].peer_type
+        type_index = model.groups[numeric.exchange.group_of(peers.peers.first)].peer_type
         forces = (
             contact_force(switched[type_index], part, numeric.jacobians[type_index], peers.parameters)
             for part in parts[type_index]

@@ -40,12 +40,12 @@ def hinf_gains(response: Responses, frequency_hz: Floats) -> tuple[HinfGains, ..
     return tuple(result)
 
 
-def h2_gains(system: Model, response: Responses) -> tuple[H2Gains, ...]:
+def h2_gains(model: Model, response: Responses) -> tuple[H2Gains, ...]:
     """Return the rms responses of the driven peer to white noise at all peers.
 
     The result is empty if a frame does not start with a tick of the fastest clock.
     """
-    ticks = ticks_in(system, response.frame)
+    ticks = ticks_in(model, response.frame)
     if ticks is None:
         return ()
     noises = []

@@ -24,7 +24,7 @@ AT_ONCE = "at once"
 
 
 def network_damping(
-    system: Model,
+    model: Model,
     damping: tuple[float, float],
     transparency_at: Callable[[Model], tuple[float, float] | None],
 ) -> NetworkDamping | None:
@@ -32,7 +32,7 @@ def network_damping(
 
     Parameters
     ----------
-    system
+    model
         The compiled model, which must be linear.
     damping
         The damping in N·s/m, and its error.
@@ -46,20 +46,20 @@ def network_damping(
     receiving = {
         link.name: {
             part.clock
-            for peer_type in system.peer_types
+            for peer_type in model.peer_types
             for part in peer_type.clocks
             if any(receive.link == link.name for receive in part.receives)
         }
-        for link in system.links
+        for link in model.links
     }
     if not receiving or any(len(clocks) != 1 for clocks in receiving.values()):
         return None
     without_delay = replace(
-        system,
-        timings=(*system.timings, Timing(AT_ONCE, Fraction(0))),
+        model,
+        timings=(*model.timings, Timing(AT_ONCE, Fraction(0))),
         links=tuple(
             replace(link, clock=next(iter(receiving[link.name])), delay=AT_ONCE, pairs=(), channel=None)
-            for link in system.links
+            for link in model.links
         ),
     )
     damping_without_network = transparency_at(without_delay)

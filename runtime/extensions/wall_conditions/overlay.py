@@ -51,7 +51,7 @@ class Overlay:
         return f"{self.condition.title}: {self.condition.formula}"
 
 
-def parse_overlay(system: Model, text: str) -> Overlay:
+def parse_overlay(model: Model, text: str) -> Overlay:
     """Return the overlay of a text `CONDITION:SYMBOL=PARAMETER,SYMBOL=QUANTITY,…` with every symbol.
 
     Raises
@@ -77,7 +77,7 @@ def parse_overlay(system: Model, text: str) -> Overlay:
             raise ApcError(Diagnostic("E886", _LOCATION, message, fix=nearest(symbol, condition.symbols)))
         if symbol in result:
             raise ApcError(Diagnostic("E886", _LOCATION, f"{symbol} is given twice"))
-        result[symbol] = _role(system, symbol, player)
+        result[symbol] = _role(model, symbol, player)
     missing = [symbol for symbol in condition.symbols if symbol not in result]
     if missing:
         requested = ", ".join(f"{symbol}, the {MEANINGS[symbol]}" for symbol in missing)
@@ -87,19 +87,19 @@ def parse_overlay(system: Model, text: str) -> Overlay:
     return Overlay(condition, tuple(result[symbol] for symbol in condition.symbols))
 
 
-def _role(system: Model, symbol: str, player: str) -> ParameterRef | float:
+def _role(model: Model, symbol: str, player: str) -> ParameterRef | float:
     """Return the value or parameter of a symbol; a quantity begins with a digit, sign or point."""
     from apc.compiler.language.units import parse_unit, quantity
 
     if player[0] in "+-.0123456789":
         return float(quantity(player, _LOCATION, subject=symbol, unit=UNITS[symbol]).value)
-    parameter_ref = find(system, player, _LOCATION)
-    name, unit = parameter_ref.name, unit_of(system, parameter_ref.name)
+    parameter_ref = find(model, player, _LOCATION)
+    name, unit = parameter_ref.name, unit_of(model, parameter_ref.name)
     if parse_unit(unit, _LOCATION).dimension != parse_unit(UNITS[symbol], _LOCATION).dimension:
         message = f"{symbol}, the {MEANINGS[symbol]}"
         raise ApcError(Diagnostic("E204", _LOCATION, message, UNITS[symbol], f"{name} in {unit}"))
     if parameter_ref.group is None:
-        groups = [group for group in system.groups if name in _local_names(group)]
+        groups = [group for group in model.groups if name in _local_names(group)]
         if groups:
             message = f"{name} differs between peers, but {symbol} is a single number"
             raise ApcError(Diagnostic("E886", _LOCATION, message, fix=f"{symbol}={groups[0].name}.{name}"))
@@ -111,17 +111,17 @@ def _local_names(group: Group) -> set[str]:
     return {value.name for value in group.values} | {column.name for column in group.columns}
 
 
-def symbol_values(system: Model, overlay: Overlay) -> tuple[float, ...]:
+def symbol_values(model: Model, overlay: Overlay) -> tuple[float, ...]:
     """Return the present value of each symbol in SI, in the order of the condition's symbols."""
-    return tuple(role if isinstance(role, float) else value_now(system, role) for role in overlay.roles)
+    return tuple(role if isinstance(role, float) else value_now(model, role) for role in overlay.roles)
 
 
-def overlay_points(system: Model, overlay: Overlay, x: Range, y: Range) -> Floats:
+def overlay_points(model: Model, overlay: Overlay, x: Range, y: Range) -> Floats:
     """Return the boundary of an overlay's condition in the plane of two parameters, as one polyline.
 
     Parameters
     ----------
-    system
+    model
         The model; its values hold for other parameters, except those that depend on an axis.
     overlay
         The condition and the parameters of its symbols.
@@ -150,7 +150,7 @@ def overlay_points(system: Model, overlay: Overlay, x: Range, y: Range) -> Float
     def margin(at_x: float, at_y: float) -> float:
         """Return the margin of the condition at a point of the plane."""
         overrides = [Override(x.free, Fraction(at_x)), Override(y.free, Fraction(at_y))]
-        return float(overlay.condition.margin(*symbol_values(apply(system, overrides), overlay)))
+        return float(overlay.condition.margin(*symbol_values(apply(model, overrides), overlay)))
 
     def crossings(margin_along: Callable[[float], float], low: float, high: float) -> list[float]:
         """Return the crossing of a grid line with the boundary: one value, or an empty list."""
