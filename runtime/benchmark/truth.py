@@ -113,8 +113,8 @@ def _loops(model: Model) -> Sequence[ModalSystem]:
 def _radius(systems: Sequence[ClosedLoop]) -> Any:
     """Return the largest absolute value of the eigenvalues that are not 1, at the present precision."""
     ball = flint.arb(0)
-    for system in systems:
-        matrix = flint.acb_mat(flint_matrix(frame_balls(system)).mid())
+    for closed_loop in systems:
+        matrix = flint.acb_mat(flint_matrix(frame_balls(closed_loop)).mid())
         size = matrix.nrows()
         # For multiple eigenvalues each QR step gains few bits: the limit is the number of bits for each
         # eigenvalue.

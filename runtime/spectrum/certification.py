@@ -102,12 +102,12 @@ class Discs:
         return True if most < 0 else False if least > 0 else None
 
 
-def prove(system: ClosedLoop, rigid_modes: RigidModes) -> Proof:
+def prove(closed_loop: ClosedLoop, rigid_modes: RigidModes) -> Proof:
     """Return a proof that a closed system is stable or unstable, in increasing precision.
 
     Parameters
     ----------
-    system
+    closed_loop
         The closed system, of at most `MOST_PROVED` strongly connected states.
     rigid_modes
         The rigid modes of the system; drifts are searched only if an eigenvalue 1 remains.
@@ -115,15 +115,15 @@ def prove(system: ClosedLoop, rigid_modes: RigidModes) -> Proof:
     searched = bool(rigid_modes.drifts) or not rigid_modes.names
     doubtful = any(
         weight_error
-        for coupling_term, weight_error in system.weight_errors.items()
-        if coupling_term not in system.surds
+        for coupling_term, weight_error in closed_loop.weight_errors.items()
+        if coupling_term not in closed_loop.surds
     )
     for bits in PRECISIONS:
         with precision(bits):
-            matrix = frame_balls(system)
+            matrix = frame_balls(closed_loop)
             polynomials = _polynomials(matrix, rigid_modes)
             if not searched and any(map(_may_vanish_at_unity, polynomials)):
-                rigid_modes, searched = find_rigid_modes(system), True
+                rigid_modes, searched = find_rigid_modes(closed_loop), True
                 polynomials = _polynomials(matrix, rigid_modes)
             result = [root_discs(polynomial) for polynomial in polynomials]
             verdicts = (

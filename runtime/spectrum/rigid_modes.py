@@ -88,14 +88,14 @@ def find_rigid_modes(system: ClosedLoop | ModalSystem, *, with_drifts: bool = Tr
     )
 
 
-def rigid_modes_of(system: ClosedLoop) -> RigidModes:
+def rigid_modes_of(closed_loop: ClosedLoop) -> RigidModes:
     """Return the rigid modes of a system, without drifts, from the matrices of its subsystems.
 
     Where the matrix proves that 1 is not an eigenvalue, the exact search is skipped.
     """
-    if excludes_unit_eigenvalue(system.matrix, system.error):
-        return RigidModes(np.zeros((len(system.names), 0)), (), ())
-    return find_rigid_modes(system, with_drifts=False)
+    if excludes_unit_eigenvalue(closed_loop.matrix, closed_loop.error):
+        return RigidModes(np.zeros((len(closed_loop.names), 0)), (), ())
+    return find_rigid_modes(closed_loop, with_drifts=False)
 
 
 @dataclass(frozen=True, slots=True)

@@ -170,36 +170,36 @@ def solve_spectrum(
     With a drift, a second eigenvalue 1 remains if only the rigid direction is removed. If no error disc
     contains 1 there is no drift, and the exact search is skipped.
     """
-    solved = [_solve_in_floats(system, rigid_modes_of(system)) for system in systems]
+    solved = [_solve_in_floats(closed_loop, rigid_modes_of(closed_loop)) for closed_loop in systems]
     lowest = max((solution.low for solution in solved), default=0.0)
     notes: list[Note] = []
-    for index, system in enumerate(systems):
+    for index, closed_loop in enumerate(systems):
         solution = solved[index]
         drifting = bool(solution.rigid_modes.names) and not solution.clear_of_unity
         if not (certify or drifting or _is_undecided(solution, lowest)):
             continue
-        reason, work = unprovable(system), _exact_work(system)
+        reason, work = unprovable(closed_loop), _exact_work(closed_loop)
         if not in_balls:
             reason = "ball arithmetic was not requested"
         elif work > exact_work:
             reason = f"its frame has {work:,} states times events; the limit is {exact_work:,}"
-        elif not reason and (states := _largest_component(system)) > MOST_PROVED:
+        elif not reason and (states := _largest_component(closed_loop)) > MOST_PROVED:
             reason = f"it has {states} states; the limit of proofs is {MOST_PROVED}"
         if not reason:
-            solved[index] = _solve_in_balls(system, solution)
+            solved[index] = _solve_in_balls(closed_loop, solution)
             continue
         if certify or _is_undecided(solution, lowest):
-            notes.append(Limitation(LimitationCode.NOT_PROVED, (system.name, reason)))
-        if work <= exact_work and drifting and (rigid_modes := find_rigid_modes(system)).drifts:
-            solved[index] = _solve_in_floats(system, rigid_modes)
+            notes.append(Limitation(LimitationCode.NOT_PROVED, (closed_loop.name, reason)))
+        if work <= exact_work and drifting and (rigid_modes := find_rigid_modes(closed_loop)).drifts:
+            solved[index] = _solve_in_floats(closed_loop, rigid_modes)
     low = max((solution.low for solution in solved), default=0.0)
     high = max((solution.high for solution in solved), default=0.0)
     largest = max((float(np.abs(solution.pairs.values).max(initial=0.0)) for solution in solved), default=0.0)
     radius = min(max(largest, low), high)  # a proof can be more accurate than the vectors of floats
     rigid = drifts = 0
-    for system, solution in zip(systems, solved, strict=True):
-        rigid += system.multiplicity * len(solution.rigid_modes.names)
-        drifts += system.multiplicity * solution.rigid_modes.drifts
+    for closed_loop, solution in zip(systems, solved, strict=True):
+        rigid += closed_loop.multiplicity * len(solution.rigid_modes.names)
+        drifts += closed_loop.multiplicity * solution.rigid_modes.drifts
     verdict = combine_verdicts([solution.inside for solution in solved], rigid, drifts)
     return Spectrum(
         modes=LazyTuple(functools.partial(_sorted_modes, tuple(systems), tuple(solved))),
@@ -263,14 +263,16 @@ class _SolvedLoop:
         return bool((np.abs(self.pairs.values - 1) > self.bounds.errors).all())
 
 
-def _largest_component(system: ClosedLoop) -> int:
+def _largest_component(closed_loop: ClosedLoop) -> int:
     """Return the number of states in the largest strongly connected component."""
-    return max((len(part) for part in components(~(np.abs(system.matrix) + system.error == 0))), default=0)
+    return max(
+        (len(part) for part in components(~(np.abs(closed_loop.matrix) + closed_loop.error == 0))), default=0
+    )
 
 
-def _exact_work(system: ClosedLoop) -> int:
+def _exact_work(closed_loop: ClosedLoop) -> int:
     """Return the number of states times the number of events of a frame."""
-    return len(system.matrix) * sum(len(group.schedule.events) for group in system.subsystems)
+    return len(closed_loop.matrix) * sum(len(group.schedule.events) for group in closed_loop.subsystems)
 
 
 def _is_undecided(solved: _SolvedLoop, lowest: float) -> bool:
@@ -317,10 +319,10 @@ def up_to(translations: int, rotations: int = 0) -> StabilityVerdict:
     return StabilityVerdict.STABLE_TURNING if rotations else StabilityVerdict.STABLE
 
 
-def _solve_in_floats(system: ClosedLoop, rigid_modes: RigidModes) -> _SolvedLoop:
+def _solve_in_floats(closed_loop: ClosedLoop, rigid_modes: RigidModes) -> _SolvedLoop:
     """Return the eigenvalues of one system, solved in floats with rigid modes removed."""
     coordinates = relative_coordinates(rigid_modes.basis)
-    matrix, error = relative_bounded(system.matrix, system.error, coordinates)
+    matrix, error = relative_bounded(closed_loop.matrix, closed_loop.error, coordinates)
     pairs, bounds = enclose_eigenvalues(matrix, error)
     inside = False if bounds.low > 1 else True if bounds.high < 1 else None  # NaN decides nothing
     low, high = bounds.low, bounds.high
@@ -329,11 +331,11 @@ def _solve_in_floats(system: ClosedLoop, rigid_modes: RigidModes) -> _SolvedLoop
     )
 
 
-def _solve_in_balls(system: ClosedLoop, estimate: _SolvedLoop) -> _SolvedLoop:
+def _solve_in_balls(closed_loop: ClosedLoop, estimate: _SolvedLoop) -> _SolvedLoop:
     """Return the eigenvalues of one system, solved in balls; undecided parts keep the result of floats."""
-    proof = prove(system, estimate.rigid_modes)
+    proof = prove(closed_loop, estimate.rigid_modes)
     if proof.rigid_modes.drifts != estimate.rigid_modes.drifts:
-        estimate = _solve_in_floats(system, proof.rigid_modes)
+        estimate = _solve_in_floats(closed_loop, proof.rigid_modes)
     inside, bits = proof.inside, proof.bits
     if inside is None and not estimate.rigid_modes.names:
         # If weights are known in floats only, balls can be wider than floats, whose bound includes them, too.
@@ -358,8 +360,8 @@ def _solve_in_balls(system: ClosedLoop, estimate: _SolvedLoop) -> _SolvedLoop:
 def _sorted_modes(systems: Sequence[ClosedLoop], solved: Sequence[_SolvedLoop]) -> tuple[Mode, ...]:
     """Return the eigenvalues of all systems, the largest first; their motion is computed on access."""
     ranked = sorted(
-        (-abs(value), system.name, value.real, -value.imag, index, row)
-        for index, (system, item) in enumerate(zip(systems, solved, strict=True))
+        (-abs(value), closed_loop.name, value.real, -value.imag, index, row)
+        for index, (closed_loop, item) in enumerate(zip(systems, solved, strict=True))
         for row, value in enumerate(item.pairs.values.tolist())
     )
     modes = []
@@ -393,26 +395,26 @@ def _mode_motions(
     """Return the motions of some eigenvalues, each given by the index of its system and its row in it."""
     result: dict[tuple[int, int], ModeMotion] = {}
     with single_threaded(), np.errstate(all="ignore"):
-        for s, (system, item) in enumerate(zip(systems, solved, strict=True)):
+        for s, (closed_loop, item) in enumerate(zip(systems, solved, strict=True)):
             rows = [row for index_of_system, row in indices if index_of_system == s]
             if rows:
-                motions = _motions_of_rows(system, item, np.array(rows, dtype=np.intp))
+                motions = _motions_of_rows(closed_loop, item, np.array(rows, dtype=np.intp))
                 result |= {(s, row): motion for row, motion in zip(rows, motions, strict=True)}
     return tuple(result[index] for index in indices)
 
 
-def _motions_of_rows(system: ClosedLoop, solved: _SolvedLoop, rows: Integers) -> list[ModeMotion]:
+def _motions_of_rows(closed_loop: ClosedLoop, solved: _SolvedLoop, rows: Integers) -> list[ModeMotion]:
     """Return the motions of some eigenvalues of a system, by their rows."""
     pairs = solved.complete.at(rows)
-    vectors, shares = complete_vectors(system, solved.coordinates, pairs)
+    vectors, shares = complete_vectors(closed_loop, solved.coordinates, pairs)
     sizes = np.abs(pairs.values)
     is_deadbeat = sizes <= np.maximum(
-        DEADBEAT * len(system.names), np.minimum(solved.bounds.errors[rows], SMALL)
+        DEADBEAT * len(closed_loop.names), np.minimum(solved.bounds.errors[rows], SMALL)
     )
     # A deadbeat mode has no frequency; a system without computed values has no deadbeat mode.
-    angles = np.full(len(rows), 0.0 if _has_discrete_updates(system) else np.nan)
+    angles = np.full(len(rows), 0.0 if _has_discrete_updates(closed_loop) else np.nan)
     angles[~is_deadbeat] = angles_in_frame(
-        system, pairs.values[~is_deadbeat], vectors[:, ~is_deadbeat], shares[:, ~is_deadbeat]
+        closed_loop, pairs.values[~is_deadbeat], vectors[:, ~is_deadbeat], shares[:, ~is_deadbeat]
     )
     motions = []
     for size, angle, deadbeat, shares_of_mode in zip(
@@ -420,22 +422,24 @@ def _motions_of_rows(system: ClosedLoop, solved: _SolvedLoop, rows: Integers) ->
     ):
         frequency, damping = 0.0, 1.0
         if not deadbeat or math.isnan(angle):
-            frequency, damping = oscillation(size, angle, system.frame_s)
-        in_transit = sum(shares_of_mode[index] for index in system.layout.indices.values())
-        participation = tuple(zip(system.names, shares_of_mode, strict=True))
+            frequency, damping = oscillation(size, angle, closed_loop.frame_s)
+        in_transit = sum(shares_of_mode[index] for index in closed_loop.layout.indices.values())
+        participation = tuple(zip(closed_loop.names, shares_of_mode, strict=True))
         motions.append(ModeMotion(frequency, damping, participation, in_transit))
     return motions
 
 
-def _has_discrete_updates(system: ClosedLoop) -> bool:
+def _has_discrete_updates(closed_loop: ClosedLoop) -> bool:
     """Return whether any discrete update, besides the exact exponential, forms the frame's map."""
-    return not system.subsystems or any(
-        not isinstance(event, Propagate) for group in system.subsystems for event in group.schedule.events
+    return not closed_loop.subsystems or any(
+        not isinstance(event, Propagate)
+        for group in closed_loop.subsystems
+        for event in group.schedule.events
     )
 
 
 def complete_vectors(
-    system: ClosedLoop,
+    closed_loop: ClosedLoop,
     coordinates: Relative,
     pairs: Eigenpairs,
 ) -> tuple[Complexes, Floats]:
@@ -443,19 +447,19 @@ def complete_vectors(
 
     Parameters
     ----------
-    system, coordinates
+    closed_loop, coordinates
         The closed system and its relative coordinates.
     pairs
         Eigenvalues (k,) of the relative coordinates, with their vectors.
     """
-    matrix = system.matrix
+    matrix = closed_loop.matrix
     eliminated, remaining, weights, count = (
         coordinates.eliminated,
         coordinates.rest,
         coordinates.weights,
         len(coordinates.eliminated),
     )
-    vectors, covectors = np.zeros((2, len(system.names), len(pairs.values)), dtype=np.complex128)
+    vectors, covectors = np.zeros((2, len(closed_loop.names), len(pairs.values)), dtype=np.complex128)
     vectors[remaining], covectors[remaining] = pairs.right, pairs.left.T
     if count:
         # Vectors of the complete state: x_p follows from (λ − M_pp − M_pr W) x_p = M_pr y.
@@ -491,7 +495,7 @@ def finite(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
-def angles_in_frame(system: ClosedLoop, values: Complexes, vectors: Complexes, shares: Floats) -> Floats:
+def angles_in_frame(closed_loop: ClosedLoop, values: Complexes, vectors: Complexes, shares: Floats) -> Floats:
     """Return the phase advance of modes in a frame (k,), in radians, with complete turns.
 
     NaN if undetermined.
@@ -502,25 +506,25 @@ def angles_in_frame(system: ClosedLoop, values: Complexes, vectors: Complexes, s
 
     Parameters
     ----------
-    system
+    closed_loop
         The closed system.
     values, vectors, shares
         Eigenvalues (k,), their vectors (n, k) over the state, and the participation of each state (n, k).
     """
     angles = np.angle(values)
-    if not system.motion or not len(values):
+    if not closed_loop.motion or not len(values):
         return angles
-    motion, mode_numbers = np.array(system.motion), np.arange(len(values))
+    motion, mode_numbers = np.array(closed_loop.motion), np.arange(len(values))
     dominant = motion[np.argmax(shares[motion], axis=0)]
-    own_states = np.setdiff1d(np.arange(len(shares)), list(system.layout.indices.values()))
+    own_states = np.setdiff1d(np.arange(len(shares)), list(closed_loop.layout.indices.values()))
     alternative = own_states[np.argmax(shares[own_states], axis=0)]
     dominant = np.where(shares[dominant, mode_numbers] > LEAST_SHARE, dominant, alternative)
     moving = shares[dominant, mode_numbers] > LEAST_SHARE
-    if not system.subsystems:
+    if not closed_loop.subsystems:
         return np.where(moving, np.nan, angles)
-    subsystem_of = np.searchsorted(system.offsets, dominant, side="right") - 1
+    subsystem_of = np.searchsorted(closed_loop.offsets, dominant, side="right") - 1
     for g, (group, offset, received) in enumerate(
-        zip(system.subsystems, system.offsets, system.received, strict=True)
+        zip(closed_loop.subsystems, closed_loop.offsets, closed_loop.received, strict=True)
     ):
         mode_indices = np.flatnonzero(moving & (subsystem_of == g))
         if len(mode_indices):

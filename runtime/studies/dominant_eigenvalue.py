@@ -66,7 +66,7 @@ def parts_of(evaluator: BatchEvaluator) -> tuple[tuple[DrivingPart, ...], tuple[
     """Return the strongly connected parts of all systems, and the possible nonzeros (n, n) of each matrix."""
     patterns, parts = [], []
     for index, wiring in enumerate(evaluator.wirings):
-        matrix, error = relative_bounded(wiring.system.matrix, wiring.system.error, wiring.relative)
+        matrix, error = relative_bounded(wiring.closed_loop.matrix, wiring.closed_loop.error, wiring.relative)
         size = np.abs(matrix) + error
         patterns.append(size != 0)
         parts += [DrivingPart(index, states) for states in driving_parts(size != 0)]
@@ -164,7 +164,7 @@ def _dominant(
         (radius - error > 1 + 4 * UNIT_ROUNDOFF) & no_other_unit.all(axis=0)
     )
     angle = np.full(count, np.nan)
-    frame_s = evaluator.wirings[0].system.frame_s
+    frame_s = evaluator.wirings[0].closed_loop.frame_s
     for part_index, (part, (pairs, _)) in enumerate(zip(parts, enclosed, strict=True)):
         points_of_part = np.flatnonzero(certain & (leading_part == part_index))
         if len(points_of_part):
@@ -208,9 +208,9 @@ def _angles(
     values, right, left
         The eigenvalues (k,) and their vectors (k, m) over the part.
     """
-    system, coordinates = wiring.system, wiring.relative
+    closed_loop, coordinates = wiring.closed_loop, wiring.relative
     count = len(values)
-    vectors, covectors = np.zeros((2, count, len(system.names)), dtype=np.complex128)
+    vectors, covectors = np.zeros((2, count, len(closed_loop.names)), dtype=np.complex128)
     vectors[:, coordinates.rest[part.states]], covectors[:, coordinates.rest[part.states]] = right, left
     if len(coordinates.eliminated):
         frame_matrix = np.broadcast_to(bounded.frame_map, (count, *bounded.frame_map.shape[1:]))
@@ -228,14 +228,14 @@ def _angles(
         vectors[:, coordinates.rest] += vectors[:, coordinates.eliminated] @ coordinates.weights.T
         covectors[:, coordinates.eliminated] = -covectors[:, coordinates.rest] @ coordinates.weights
     participations = np.abs(vectors * covectors)
-    motion = np.array(system.motion, dtype=np.intp)
+    motion = np.array(closed_loop.motion, dtype=np.intp)
     result = np.full(count, np.nan)
     if not len(motion):
         return result
     largest_state = motion[participations[:, motion].argmax(axis=1)]
     moves = participations[np.arange(count), largest_state] > LEAST_SHARE * participations.sum(axis=1)
-    subsystem_of = np.searchsorted(system.offsets, largest_state, side="right") - 1
-    for g, (group, offset) in enumerate(zip(system.subsystems, system.offsets, strict=True)):
+    subsystem_of = np.searchsorted(closed_loop.offsets, largest_state, side="right") - 1
+    for g, (group, offset) in enumerate(zip(closed_loop.subsystems, closed_loop.offsets, strict=True)):
         indices = np.flatnonzero(moves & (subsystem_of == g))
         if not len(indices):
             continue

@@ -143,7 +143,7 @@ class BatchEvaluator:
     @property
     def closed(self) -> tuple[ClosedLoop, ...]:
         """The closed systems at a generic point."""
-        return tuple(wiring.system for wiring in self.wirings)
+        return tuple(wiring.closed_loop for wiring in self.wirings)
 
     @property
     def timed(self) -> bool:
@@ -203,7 +203,7 @@ class BatchEvaluator:
 
         If the parameter is a time, only step durations change.
         """
-        used = {group.index for system in systems for group in system.subsystems}
+        used = {group.index for closed_loop in systems for group in closed_loop.subsystems}
         at_value = {
             group.index: (vector, linearize_exact(group.jacobians, group.exact_at(vector)))
             for group, vector in self._parameters_at(value)
@@ -217,7 +217,8 @@ class BatchEvaluator:
             return replace(group, parameters=vector, exact_parameters=numbers, exact=exact)
 
         return tuple(
-            replace(system, subsystems=tuple(map(at_point, system.subsystems))) for system in systems
+            replace(closed_loop, subsystems=tuple(map(at_point, closed_loop.subsystems)))
+            for closed_loop in systems
         )
 
     def _parameters_at(self, value: Sequence[float]) -> list[tuple[PeerClass, Floats]]:
@@ -248,9 +249,9 @@ class BatchEvaluator:
                 lifts[group.index] = self._lift_bounded(group, vectors(group))
         bounded_systems = []
         for wiring in self.wirings:
-            system = wiring.system
-            subsystems, maps = zip(*(lifts[group.index] for group in system.subsystems), strict=True)
-            closed = interconnect(maps, wiring.feedback, system.layout, numbers=MIDPOINT_RADIUS)
+            closed_loop = wiring.closed_loop
+            subsystems, maps = zip(*(lifts[group.index] for group in closed_loop.subsystems), strict=True)
+            closed = interconnect(maps, wiring.feedback, closed_loop.layout, numbers=MIDPOINT_RADIUS)
             complete = value_of(closed.matrix)
             coordinates, is_valid = relative_at(wiring, complete)
             relative_matrix = relative(closed.matrix, with_uncertainty(coordinates), MIDPOINT_RADIUS)
@@ -449,7 +450,9 @@ def lifted_systems(systems: Sequence[Wired]) -> tuple[Wired, ...]:
         subsystem, frame = cached[key]
         return replace(group, subsystem=subsystem).with_lifted(frame)
 
-    return tuple(replace(system, subsystems=tuple(map(lifted, system.subsystems))) for system in systems)
+    return tuple(
+        replace(closed_loop, subsystems=tuple(map(lifted, closed_loop.subsystems))) for closed_loop in systems
+    )
 
 
 def is_too_large(a: Matrices, b: Matrices) -> NDArray[np.bool_]:

@@ -41,32 +41,32 @@ class LoopStructure:
     `rigid` are the removed rigid modes, `relative` the remaining coordinates.
     """
 
-    system: ClosedLoop
+    closed_loop: ClosedLoop
     feedback: tuple[InterconnectionMatrices, ...]  # one per subsystem, with its radii
     rigid: RigidModes
     relative: Relative
     modes_vary: bool  # the directions, and W, depend on free parameters
 
 
-def loop_structure(system: ClosedLoop) -> LoopStructure:
+def loop_structure(closed_loop: ClosedLoop) -> LoopStructure:
     """Return the interconnection of a closed system, with its rigid modes removed."""
-    feedback = tuple(feedback_of(system, system.layout))
-    rigid = rigid_modes_of(system)
-    structure = _structure_without(system, feedback, rigid)
+    feedback = tuple(feedback_of(closed_loop, closed_loop.layout))
+    rigid = rigid_modes_of(closed_loop)
+    structure = _structure_without(closed_loop, feedback, rigid)
     if rigid.names:
-        relative_matrix = reduced(structure, system.matrix[None], 1)[0]
+        relative_matrix = reduced(structure, closed_loop.matrix[None], 1)[0]
         if np.isfinite(relative_matrix).all() and np.any(
             np.abs(np.linalg.eigvals(relative_matrix) - 1) < NEAR_UNITY
         ):
-            structure = _structure_without(system, feedback, find_rigid_modes(system))
+            structure = _structure_without(closed_loop, feedback, find_rigid_modes(closed_loop))
     return structure
 
 
 def _structure_without(
-    system: ClosedLoop, feedback: tuple[InterconnectionMatrices, ...], rigid: RigidModes
+    closed_loop: ClosedLoop, feedback: tuple[InterconnectionMatrices, ...], rigid: RigidModes
 ) -> LoopStructure:
     """Return the loop structure of a closed system with these rigid modes removed."""
-    return LoopStructure(system, feedback, rigid, relative_coordinates(rigid.basis), modes_vary=False)
+    return LoopStructure(closed_loop, feedback, rigid, relative_coordinates(rigid.basis), modes_vary=False)
 
 
 def with_constant_pivots(wiring: LoopStructure, rigid_elsewhere: RigidModes) -> LoopStructure:
@@ -103,8 +103,10 @@ def with_constant_pivots(wiring: LoopStructure, rigid_elsewhere: RigidModes) -> 
 
 def closed_loop(wiring: LoopStructure, lifted: Mapping[int, FrameMap]) -> Matrices:
     """Return the closed-loop matrices (k, n, n) of one system at all points."""
-    maps = [lifted[group.index] for group in wiring.system.subsystems]
-    return interconnect(maps, [feedback.plain for feedback in wiring.feedback], wiring.system.layout).matrix
+    maps = [lifted[group.index] for group in wiring.closed_loop.subsystems]
+    return interconnect(
+        maps, [feedback.plain for feedback in wiring.feedback], wiring.closed_loop.layout
+    ).matrix
 
 
 def reduced(wiring: LoopStructure, matrix: Matrices, count: int) -> Matrices:

@@ -337,10 +337,10 @@ class DelayPath(AnalyzedPath):
         except ApcError:  # an analysis avoids a matrix that is too large
             return 1.0
         if len(systems) not in self.rigid:
-            self.rigid[len(systems)] = [len(rigid_modes_of(system).names) for system in systems]
+            self.rigid[len(systems)] = [len(rigid_modes_of(closed_loop).names) for closed_loop in systems]
         largest = 0.0
-        for system, count in zip(systems, self.rigid[len(systems)], strict=True):
-            values = np.linalg.eigvals(system.matrix)
+        for closed_loop, count in zip(systems, self.rigid[len(systems)], strict=True):
+            values = np.linalg.eigvals(closed_loop.matrix)
             moving = np.argsort(np.abs(values - 1))[count:]
             largest = max(largest, float(np.abs(values[moving]).max(initial=0.0)))
         return largest

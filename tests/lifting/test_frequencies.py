@@ -90,12 +90,14 @@ def test_a_certified_real_negative_eigenvalue_keeps_its_frequency_and_damping(na
 
 
 def test_what_a_mode_turns_hangs_on_no_phase_of_its_vector() -> None:
-    for system in split(*lifted_classes(numeric_model(apc.compile(TOPOLOGIES / "two-users-reported.yaml")))):
-        values, vectors = np.linalg.eig(system.matrix.astype(complex))
+    for closed_loop in split(
+        *lifted_classes(numeric_model(apc.compile(TOPOLOGIES / "two-users-reported.yaml")))
+    ):
+        values, vectors = np.linalg.eig(closed_loop.matrix.astype(complex))
         values.imag[np.abs(values.imag) < 1e-12] = 0.0
         shares = np.abs(vectors * np.linalg.pinv(vectors).T)
         turned = np.exp(1j * np.array([0.0, 0.7, 2.0]))
-        angles = [angles_in_frame(system, values, vectors * turn, shares) for turn in turned]
+        angles = [angles_in_frame(closed_loop, values, vectors * turn, shares) for turn in turned]
         assert np.allclose(angles, angles[0], equal_nan=True)
 
 

@@ -82,12 +82,12 @@ class ParametricFrames:
 class ParametricClosedLoop:
     """A closed system over a box: its subsystems with symbolic parameters, and their coupling.
 
-    `system` is the closed system at a point of the box, `frames` its subsystems over the box, and
+    `closed_loop` is the closed system at a point of the box, `frames` its subsystems over the box, and
     `feedback` the interconnection of each. `relative` are relative coordinates that are valid over the
     complete box. `inside` is the required bound on the magnitude of eigenvalues.
     """
 
-    system: ClosedLoop
+    closed_loop: ClosedLoop
     frames: ParametricFrames
     feedback: tuple[InterconnectionMatrices, ...]
     relative: Relative
@@ -108,13 +108,13 @@ class Contraction:
 
 
 def parametric_closed_loop(
-    system: ClosedLoop, subsystems: Sequence[LinearSubsystem], rigid: RigidModes, radius: float = 1.0
+    closed_loop: ClosedLoop, subsystems: Sequence[LinearSubsystem], rigid: RigidModes, radius: float = 1.0
 ) -> ParametricClosedLoop:
     """Return a closed loop whose matrices can be evaluated over cells of a box of parameter ranges.
 
     Parameters
     ----------
-    system
+    closed_loop
         The system, at some point of the box.
     subsystems
         The matrices of its subsystems, with entries `Fraction`, or `Ratio` (a rational function of the
@@ -125,9 +125,9 @@ def parametric_closed_loop(
         The radius of the circle that must contain the eigenvalues.
     """
     return ParametricClosedLoop(
-        system,
-        parametric_frames(tuple(subsystems), system.subsystems),
-        tuple(feedback_of(system, system.layout)),
+        closed_loop,
+        parametric_frames(tuple(subsystems), closed_loop.subsystems),
+        tuple(feedback_of(closed_loop, closed_loop.layout)),
         with_uncertainty(relative_coordinates(rigid.basis)),
         radius,
     )
@@ -285,7 +285,7 @@ def matrices_over(problem: ParametricClosedLoop, cells: Sequence[Cell]) -> Matri
         InterconnectionMatrices(within(feedback.direct, count), within(feedback.delayed, count))
         for feedback in problem.feedback
     ]
-    closed = interconnect(maps, received, problem.system.layout, numbers=taylor(count)).matrix
+    closed = interconnect(maps, received, problem.closed_loop.layout, numbers=taylor(count)).matrix
     closed = np.broadcast_to(closed, (len(cells), *closed.shape[-3:]))
     coordinates = replace(problem.relative, weights=within(problem.relative.weights, count))
     values = relative(closed, coordinates, taylor(count))
