@@ -383,7 +383,7 @@ def _spectrum(
         spectrum, notes = _solve_populations(numeric)
     elif plan.method == "determinant":
         spectrum = _solve_determinant(plan.loops)
-        matrices_fit = all(loop.states <= MATRIX_STATES for loop in plan.loops)
+        matrices_fit = all(modal_system.states <= MATRIX_STATES for modal_system in plan.loops)
         if method == "auto" and spectrum.stable is None and matrices_fit:
             decomposed = decompose(plan.groups, numeric.exchange)
             plan = replace(plan, method=decomposed.method, notes=decomposed.notes)
@@ -415,10 +415,12 @@ def _neutral_modes(
     counts as a translation.
     """
     if not spectrum.rigid_modes or not any(
-        map(_has_other_states, (*population, *(g for loop in loops for g in loop.subsystems)))
+        map(_has_other_states, (*population, *(g for modal_system in loops for g in modal_system.subsystems)))
     ):
         return NeutralModes(spectrum.rigid_modes, 0, spectrum.drifts, 0, ())
-    systems: Sequence[tuple[ModalSystem, int]] = [(loop, loop.multiplicity) for loop in loops]
+    systems: Sequence[tuple[ModalSystem, int]] = [
+        (modal_system, modal_system.multiplicity) for modal_system in loops
+    ]
     for group in population:
         generic_coupling = {
             coupling_term: ((Fraction(-1, 3),),) for coupling_term in used_coupling_terms([group.schedule])
@@ -426,8 +428,8 @@ def _neutral_modes(
         systems = [*systems, (ModalSystem(group.name, 1, (group,), generic_coupling), group.count)]
     with_drifts = bool(spectrum.drifts and loops)
     pairs = [
-        (classify_neutral_modes(loop, with_drifts=with_drifts), multiplicity)
-        for loop, multiplicity in systems
+        (classify_neutral_modes(modal_system, with_drifts=with_drifts), multiplicity)
+        for modal_system, multiplicity in systems
     ]
     names = tuple(dict.fromkeys(name for neutral, _ in pairs for name in neutral.names))
     unobservable = sum(neutral.unobservable * multiplicity for neutral, multiplicity in pairs)
@@ -454,7 +456,7 @@ def _solve_closed(
     model: Model, loops: Sequence[ModalSystem], *, certify: bool, exact_work: float
 ) -> Spectrum:
     """Return the spectrum of loops from their matrices."""
-    closed = tuple(close_loop(loop) for loop in loops)
+    closed = tuple(close_loop(modal_system) for modal_system in loops)
     if not all(
         np.isfinite(closed_system.matrix).all() and np.isfinite(closed_system.error).all()
         for closed_system in closed

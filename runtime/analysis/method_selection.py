@@ -139,31 +139,41 @@ def make_plan(numeric: NumericModel, method: str = "auto") -> AnalysisPlan:
         if method == "modes" and decomposed.method != "modes":
             raise cannot_serve(model, method, decomposed.notes[0])
         loops, chosen_method, notes = decomposed.loops, decomposed.method, decomposed.notes
-        packets = max(sum(sum(group.schedule.depths) for group in loop.subsystems) for loop in loops)
+        packets = max(
+            sum(sum(group.schedule.depths) for group in modal_system.subsystems) for modal_system in loops
+        )
         stored_outputs = max(
-            sum(len(group.schedule.discrete_states) for group in loop.subsystems) for loop in loops
+            sum(len(group.schedule.discrete_states) for group in modal_system.subsystems)
+            for modal_system in loops
         )
         if method == "determinant":
             chosen_method = method
         elif method == "auto" and (
-            any(_long_lines(group.schedule) for loop in loops for group in loop.subsystems)
-            or (packets + stored_outputs > LONG_LINES and max(loop.states for loop in loops) > MATRIX_STATES)
+            any(_long_lines(group.schedule) for modal_system in loops for group in modal_system.subsystems)
+            or (
+                packets + stored_outputs > LONG_LINES
+                and max(modal_system.states for modal_system in loops) > MATRIX_STATES
+            )
         ):
             chosen_method = "determinant"
             in_flight = f"{packets:,} packets in transit are not states"
             notes = (*notes, in_flight if packets > LONG_LINES else "a single matrix is too large")
     if chosen_method != "determinant":
-        for loop in loops:
-            if loop.states > MATRIX_STATES:
-                raise too_large(exchange, f"{exchange.peers:,} peers", loop.states, auto=method == "auto")
+        for modal_system in loops:
+            if modal_system.states > MATRIX_STATES:
+                raise too_large(
+                    exchange, f"{exchange.peers:,} peers", modal_system.states, auto=method == "auto"
+                )
         needed_bytes = (
-            CACHE_SIZE * sum(loop.states**2 for loop in loops)
-            + AT_WORK * max(loop.states for loop in loops) ** 2
+            CACHE_SIZE * sum(modal_system.states**2 for modal_system in loops)
+            + AT_WORK * max(modal_system.states for modal_system in loops) ** 2
         )
-        message = f"{len(loops):,} systems of up to {max(loop.states for loop in loops):,} states"
+        message = (
+            f"{len(loops):,} systems of up to {max(modal_system.states for modal_system in loops):,} states"
+        )
     else:
-        needed_bytes = sum(_determinant_memory(loop) for loop in loops)
-        subsystems = sum(len(loop.subsystems) for loop in loops)
+        needed_bytes = sum(_determinant_memory(modal_system) for modal_system in loops)
+        subsystems = sum(len(modal_system.subsystems) for modal_system in loops)
         message = f"{len(loops):,} determinants of {subsystems:,} different peers"
     refuse_beyond(
         needed_bytes,
@@ -201,20 +211,22 @@ def cannot_serve(model: Model, method: str, reason: str) -> ApcError:
 def _sizes(loops: Sequence[ModalSystem], method: str) -> tuple[tuple[int, int], ...]:
     """Return (count, size) of the loops: the size is in states, or in rows of the determinant."""
     sizes = Counter(
-        sum(len(group.schedule.sent) for group in loop.subsystems) if method == "determinant" else loop.states
-        for loop in loops
+        sum(len(group.schedule.sent) for group in modal_system.subsystems)
+        if method == "determinant"
+        else modal_system.states
+        for modal_system in loops
     )
     return tuple((count, size) for size, count in sizes.items())
 
 
-def _determinant_memory(loop: ModalSystem) -> int:
+def _determinant_memory(modal_system: ModalSystem) -> int:
     """Return the memory in bytes of a loop's determinant, given by its numbers of sent and received
     values.
     """
-    entries = sum(len(subsystem.schedule.sent) for subsystem in loop.subsystems) * sum(
-        len(subsystem.schedule.received) for subsystem in loop.subsystems
+    entries = sum(len(subsystem.schedule.sent) for subsystem in modal_system.subsystems) * sum(
+        len(subsystem.schedule.received) for subsystem in modal_system.subsystems
     )
-    return (CACHE_SIZE_OF_SUBSYSTEM * len(loop.subsystems) + SUBSYSTEM_AT_WORK) * entries
+    return (CACHE_SIZE_OF_SUBSYSTEM * len(modal_system.subsystems) + SUBSYSTEM_AT_WORK) * entries
 
 
 def not_populations(model: Model, jacobians: Sequence[SubsystemJacobians]) -> str:

@@ -69,7 +69,7 @@ def spectral_truth(model: Model) -> Truth:
     NotSupportedError
         There is no reference; the text is the reason.
     """
-    systems = [close_loop(loop) for loop in _loops(model)]
+    systems = [close_loop(modal_system) for modal_system in _loops(model)]
     if reason := next(filter(None, map(unprovable, systems)), ""):
         raise NotSupportedError(reason)
     previous = None
@@ -99,13 +99,13 @@ def _loops(model: Model) -> Sequence[ModalSystem]:
     groups, exchange = lifted_classes(numeric_model(model))
     loops = decompose(groups, exchange).loops
     if any(
-        weight_error and coupling_term not in loop.surds
-        for loop in loops
-        for coupling_term, weight_error in loop.weight_errors.items()
+        weight_error and coupling_term not in modal_system.surds
+        for modal_system in loops
+        for coupling_term, weight_error in modal_system.weight_errors.items()
     ):
         loops = (dense_loop(groups, exchange),)  # the eigenvalues of the graph are not exact
-    if sum(loop.states**3 for loop in loops) > BALL_STATES**3:
-        most = max(loop.states for loop in loops)
+    if sum(modal_system.states**3 for modal_system in loops) > BALL_STATES**3:
+        most = max(modal_system.states for modal_system in loops)
         raise NotSupportedError(f"the eigenvalues of one system of {most:,} states {TOO_LONG}")
     return loops
 

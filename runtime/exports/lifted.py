@@ -242,10 +242,12 @@ def lifted(
         link = _link_of(model, open_at)
         driven_peers = [_open_loop(model, group, "" if link else open_at, numbers) for group in groups]
         _check_size(model, driven_peers)
-        loop = dense_loop([item.group for item in driven_peers], exchange)
+        modal_system = dense_loop([item.group for item in driven_peers], exchange)
         peers_of_class = {item.group.index: item for item in driven_peers}
-        subsystems = [peers_of_class[subsystem.index] for subsystem in loop.subsystems]
-        blocks, labels = _closed(loop, subsystems, link=link, open_at=open_at, arithmetic=numbers.arithmetic)
+        subsystems = [peers_of_class[subsystem.index] for subsystem in modal_system.subsystems]
+        blocks, labels = _closed(
+            modal_system, subsystems, link=link, open_at=open_at, arithmetic=numbers.arithmetic
+        )
     notes = () if open_at else tuple(dict.fromkeys(note for item in driven_peers for note in item.unpushed))
     return blocks, labels, notes
 
@@ -453,7 +455,7 @@ def _check_size(model: Model, opened: Sequence[_DrivenPeers]) -> None:
 
 
 def _closed(
-    loop: ModalSystem,
+    modal_system: ModalSystem,
     subsystems: Sequence[_DrivenPeers],
     *,
     link: str,
@@ -465,15 +467,15 @@ def _closed(
 
     Parameters
     ----------
-    loop, subsystems
+    modal_system, subsystems
         The loop of all peers, and the driven peers of each subsystem.
     link, open_at
         The link at which the loop is cut, "" for none; and the link or coupler.
     arithmetic
         The number type.
     """
-    layout = lay_out_loop(loop)
-    n, peers = len(layout.names), [subsystem.name for subsystem in loop.subsystems]
+    layout = lay_out_loop(modal_system)
+    n, peers = len(layout.names), [subsystem.name for subsystem in modal_system.subsystems]
     received = [subsystem.group.schedule.received for subsystem in subsystems]
     external_rows = [
         [
@@ -487,7 +489,9 @@ def _closed(
         _with_external_receptions(subsystem.map, rows)
         for subsystem, rows in zip(subsystems, external_rows, strict=True)
     ]
-    closed_loop = interconnect_with_inputs(loop, maps, [*map(len, external_rows)], layout, numbers=arithmetic)
+    closed_loop = interconnect_with_inputs(
+        modal_system, maps, [*map(len, external_rows)], layout, numbers=arithmetic
+    )
 
     def in_state(signals_of_subsystems: Sequence[Placed]) -> tuple[Labels, Indices]:
         """Return the signals of all subsystems, named by peer, and their indices in the state."""

@@ -160,13 +160,17 @@ def port_loops(numeric: NumericModel, *, option: str) -> tuple[PortLoop, ...]:
     is_orthogonal = all(exchange.links[link].graph.shape in ORTHOGONAL for link in used)
     loops, weighted = accepted_loops(with_inputs, exchange, lambda _: is_orthogonal, option)
     result = []
-    for loop in loops:
+    for modal_system in loops:
         # A loop without devices is one of the model with its devices clamped.
-        if any(subsystem.index in device_inputs for subsystem in loop.subsystems):
-            represents_all = weighted and len(loop.subsystems) > 1
+        if any(subsystem.index in device_inputs for subsystem in modal_system.subsystems):
+            represents_all = weighted and len(modal_system.subsystems) > 1
             result.append(
                 _port_loop(
-                    loop, device_inputs, represents_all=represents_all, location=location, option=option
+                    modal_system,
+                    device_inputs,
+                    represents_all=represents_all,
+                    location=location,
+                    option=option,
                 )
             )
     return tuple(result)
@@ -274,7 +278,7 @@ def _without_device_states(subsystem: LinearSubsystem, device: Device) -> Linear
 
 
 def _port_loop(
-    loop: ModalSystem,
+    modal_system: ModalSystem,
     device_inputs: Mapping[int, _DeviceInput],
     *,
     represents_all: bool,
@@ -285,7 +289,7 @@ def _port_loop(
 
     Parameters
     ----------
-    loop
+    modal_system
         The loop.
     device_inputs
         The device inputs, by the index of the class.
@@ -294,15 +298,17 @@ def _port_loop(
     location, option
         The location and the command-line option, for messages.
     """
-    gripped = [number for number, subsystem in enumerate(loop.subsystems) if subsystem.index in device_inputs]
-    subsystems = [device_inputs[loop.subsystems[number].index] for number in gripped]
-    counts = [loop.subsystems[number].count if represents_all else 1 for number in gripped]
+    gripped = [
+        number for number, subsystem in enumerate(modal_system.subsystems) if subsystem.index in device_inputs
+    ]
+    subsystems = [device_inputs[modal_system.subsystems[number].index] for number in gripped]
+    counts = [modal_system.subsystems[number].count if represents_all else 1 for number in gripped]
     lengths = [len(subsystem.seconds) for subsystem in subsystems]
     if (m := sum(lengths)) > MOST_INTERVALS:
         message = f"different devices have {m:,} intervals of sampling and force in a frame"
         advice = f"reduce the number of different peers (limit: {MOST_INTERVALS:,} intervals)"
         raise ApcError(Diagnostic("E933", location, f"{option}: {message}", advice=advice))
-    closed = close_loop(loop)
+    closed = close_loop(modal_system)
     pairs = [
         (closed.offsets[number], subsystem.ports)
         for number, subsystem in zip(gripped, subsystems, strict=True)
@@ -336,7 +342,7 @@ def _port_loop(
     )
     static_states = _static_response(a, input_matrix, incidence)
     if static_states is None:
-        rigid = find_rigid_modes(loop).basis
+        rigid = find_rigid_modes(modal_system).basis
         if rigid.size and not rigid[output_indices].any():  # a rigid mode without an effect on devices
             coordinates = with_uncertainty(relative_coordinates(rigid[rest]))
             reduced_rows = relative_rows(
@@ -379,8 +385,8 @@ def _port_loop(
         with_error_radius(damping, np.diag(incidence @ uncertainty + 8 * UNIT_ROUNDOFF) * damping), half
     )
     return PortLoop(
-        name=loop.name,
-        multiplicity=loop.multiplicity,
+        name=modal_system.name,
+        multiplicity=modal_system.multiplicity,
         a=a,
         b=multiply(b, units),
         c=multiply(units, output_matrix),

@@ -155,16 +155,16 @@ def _intervals(schedule: Schedule) -> tuple[list[int], list[int]]:
     return starts, lengths
 
 
-def driven_mode(loop: ModalSystem, subsystems: Mapping[int, DrivenPeer]) -> DrivenMode:
+def driven_mode(modal_system: ModalSystem, subsystems: Mapping[int, DrivenPeer]) -> DrivenMode:
     """Return a closed loop of driven peers, its inputs and readings separated from the state.
 
     Parameters
     ----------
-    loop, subsystems
+    modal_system, subsystems
         The loop of classes from `driven_subsystem`, and their driven peers by the index of the class.
     """
-    closed = close_loop(loop)
-    driven_peers = [subsystems[group.index] for group in loop.subsystems]
+    closed = close_loop(modal_system)
+    driven_peers = [subsystems[group.index] for group in modal_system.subsystems]
     closed_matrix = with_error_radius(closed.matrix, closed.error)
     pairs = list(zip(closed.offsets, driven_peers, strict=True))
     added = [start + index for start, subsystem in pairs for index in subsystem.ports.added]
@@ -184,7 +184,7 @@ def driven_mode(loop: ModalSystem, subsystems: Mapping[int, DrivenPeer]) -> Driv
         )
     input_indices, output_indices = coupling_terms
     return DrivenMode(
-        name=loop.name,
+        name=modal_system.name,
         subsystems=tuple(driven_peers),
         m=closed_matrix[:, remaining[:, None], remaining],
         k=closed_matrix[:, remaining[:, None], input_indices],

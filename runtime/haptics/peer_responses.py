@@ -111,13 +111,15 @@ def responses(numeric: NumericModel, port: DevicePort, other: DevicePort) -> Res
     )
     name = common.subsystems[driven_index].name
     difference_loops = [
-        number for number, loop in enumerate(driven_loops) if number and loop.subsystems[0].name == name
+        number
+        for number, modal_system in enumerate(driven_loops)
+        if number and modal_system.subsystems[0].name == name
     ]
     return Responses(
         exchange=exchange,
         device=gripped[port],
         other=gripped[other],
-        loops=tuple(driven_mode(loop, subsystems) for loop in driven_loops),
+        loops=tuple(driven_mode(modal_system, subsystems) for modal_system in driven_loops),
         plain=plain,
         members=tuple(subsystem.count for subsystem in common.subsystems),
         local=driven_index,
@@ -177,8 +179,9 @@ def _are_by_class(loops: Sequence[ModalSystem]) -> bool:
     common, *difference_loops = loops
     many = {subsystem.name: subsystem.count - 1 for subsystem in common.subsystems}
     return all(
-        len(loop.subsystems) == 1 and loop.multiplicity == many.get(loop.subsystems[0].name)
-        for loop in difference_loops
+        len(modal_system.subsystems) == 1
+        and modal_system.multiplicity == many.get(modal_system.subsystems[0].name)
+        for modal_system in difference_loops
     )
 
 
@@ -237,7 +240,7 @@ class Responses:
     @functools.cached_property
     def bases(self) -> tuple[Floats, ...]:
         """The bases of the rigid modes of each loop."""
-        return tuple(find_rigid_modes(loop).basis for loop in self.plain)
+        return tuple(find_rigid_modes(modal_system).basis for modal_system in self.plain)
 
     @functools.cached_property
     def drifting(self) -> bool:

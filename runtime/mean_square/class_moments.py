@@ -79,9 +79,9 @@ class PerTickReception:
     quantum: Fraction
     strictly: bool  # a tick does not receive a packet that arrives at the same instant
 
-    def of(self, loop: ModalSystem) -> list[tuple[UncertainSample, ...]]:
+    def of(self, modal_system: ModalSystem) -> list[tuple[UncertainSample, ...]]:
         """Return the received sample of each row of r, for each subsystem of a loop."""
-        return [self.rows[subsystem.index] for subsystem in loop.subsystems]
+        return [self.rows[subsystem.index] for subsystem in modal_system.subsystems]
 
 
 def build_reception(
@@ -173,7 +173,7 @@ class PeerVersusRest:
     them. `neutral` are the loop's rigid motions over the subsystems' own z.
     """
 
-    loop: ModalSystem
+    modal_system: ModalSystem
     class_of: tuple[int, ...]
     candidates: tuple[int, ...]
     neutral: Floats
@@ -229,9 +229,11 @@ def classes_of(reception: PerTickReception) -> Classes:
             )
             for coupling_term, rows in weights.items()
         }
-        loop = ModalSystem(peer_class.name, 1, tuple(subsystem for _, subsystem, _ in subsystems), coupling)
+        modal_system = ModalSystem(
+            peer_class.name, 1, tuple(subsystem for _, subsystem, _ in subsystems), coupling
+        )
         class_data = tuple(g for g, *_ in subsystems), tuple(candidates for *_, candidates in subsystems)
-        loops.append(PeerVersusRest(loop, *class_data, neutral_motions(loop)))
+        loops.append(PeerVersusRest(modal_system, *class_data, neutral_motions(modal_system)))
     return Classes(reception, common, weights, tuple(loops))
 
 
@@ -313,10 +315,10 @@ def moments_of(
     blocks, moving, states = list[MomentBlock](), list[MomentCoordinates](), 0
     for h, peer_versus_rest in enumerate(classes.loops):
         driving = [moment_class for moment_class in moment_classes if moment_class.receiver == h]
-        rows = classes.reception.of(peer_versus_rest.loop)
+        rows = classes.reception.of(peer_versus_rest.modal_system)
         received_channels = [moment_class.received_channel for moment_class in driving]
         mean = mean_loop(
-            peer_versus_rest.loop, rows, memories, received_channels, peer_versus_rest.neutral, frames
+            peer_versus_rest.modal_system, rows, memories, received_channels, peer_versus_rest.neutral, frames
         )
         n = len(mean.coordinates.rest)
         for moment_class, channel in [(None, None), *zip(driving, mean.channels, strict=True)]:
@@ -459,10 +461,10 @@ def _moment_classes(classes: Classes, memories: Sequence[RouteMemory]) -> list[_
     return moment_classes
 
 
-def neutral_motions(loop: ModalSystem) -> Floats:
+def neutral_motions(modal_system: ModalSystem) -> Floats:
     """Return the rigid modes of a loop over its subsystems' own states (n, d)."""
-    states = sum(len(subsystem.z_names) for subsystem in loop.subsystems)
-    return find_rigid_modes(without_packets(loop), with_drifts=False).basis[:states]
+    states = sum(len(subsystem.z_names) for subsystem in modal_system.subsystems)
+    return find_rigid_modes(without_packets(modal_system), with_drifts=False).basis[:states]
 
 
 def peer_classes(reception: PerTickReception) -> tuple[ModalSystem, Coupling]:

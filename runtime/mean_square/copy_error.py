@@ -194,7 +194,7 @@ def moments_error(peer_moments: Moments, classes: Sequence[tuple[int, PeerReadin
         subsystems = [
             (subsystem.count, classes[g][1])
             for subsystem, g in zip(
-                block_coordinates.loop.loop.subsystems, block_coordinates.loop.class_of, strict=True
+                block_coordinates.loop.modal_system.subsystems, block_coordinates.loop.class_of, strict=True
             )
         ]
         for copy, index, row in _error_rows(

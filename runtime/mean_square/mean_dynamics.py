@@ -249,7 +249,7 @@ def with_memory(
 
 
 def mean_loop(
-    loop: ModalSystem,
+    modal_system: ModalSystem,
     received: Sequence[Sequence[UncertainSample]],
     memory: Sequence[RouteMemory],
     received_channels: Sequence[ReceivedChannel],
@@ -264,7 +264,7 @@ def mean_loop(
 
     Parameters
     ----------
-    loop
+    modal_system
         The loop, with a separate reception at each tick.
     received
         The received sample of each row of r of each subsystem.
@@ -280,7 +280,8 @@ def mean_loop(
     """
     memory_by_route = {item.route: item for item in memory}
     subsystems = [
-        with_memory(group, memory, frames[group.name] if frames else None) for group in loop.subsystems
+        with_memory(group, memory, frames[group.name] if frames else None)
+        for group in modal_system.subsystems
     ]
     offsets = np.cumsum([0] + [subsystem.states for subsystem in subsystems]).tolist()
     starts = np.cumsum([0] + [subsystem.map.s.shape[-2] for subsystem in subsystems]).tolist()
@@ -305,11 +306,11 @@ def mean_loop(
             if item is None or row.gap or row.channel not in item.channels:
                 continue  # a missing value is held, without substitution
             value = item.memory.received[row.clock, row.tick]
-            for h, weight in enumerate(loop.coupling[row.coupling_term][g]):
+            for h, weight in enumerate(modal_system.coupling[row.coupling_term][g]):
                 if weight:
                     index = starts[h] + subsystems[h].values[item.route, row.channel, value]
                     direct[:2, input_row, index] = bounded_weight(
-                        weight, loop.weight_errors.get(row.coupling_term, 0.0)
+                        weight, modal_system.weight_errors.get(row.coupling_term, 0.0)
                     )
             index = item.channels.index(row.channel) * len(item.memory.old) + value
             for channel, channel_values, first in zip(received_channels, values, firsts, strict=False):
@@ -328,7 +329,7 @@ def mean_loop(
         feedback.append(InterconnectionMatrices(direct, delayed))
     closed = interconnect([subsystem.map for subsystem in subsystems], feedback, layout, numbers=numbers)
     coordinates = relative_coordinates(
-        with_stored_values(closed.matrix[..., : offsets[-1]], neutral, loop, offsets)
+        with_stored_values(closed.matrix[..., : offsets[-1]], neutral, modal_system, offsets)
     )
     remaining, n = coordinates.rest, len(coordinates.rest)
     relative_matrix = relative_rows(closed.matrix, with_uncertainty(coordinates, numbers), numbers)
@@ -365,7 +366,9 @@ def mean_loop(
     return MeanLoop(matrix, tuple(channels), coordinates, tuple(offsets), sent_errors)
 
 
-def with_stored_values(matrix: Matrix, neutral: Floats, loop: ModalSystem, offsets: Sequence[int]) -> Floats:
+def with_stored_values(
+    matrix: Matrix, neutral: Floats, modal_system: ModalSystem, offsets: Sequence[int]
+) -> Floats:
     """Return the rigid modes (n_z, m), extended by the stored values to all states of the matrix.
 
     A rigid mode is constant, so its stored values s solve s = M_ss s + M_sz z. With rational weights they are
@@ -377,7 +380,7 @@ def with_stored_values(matrix: Matrix, neutral: Floats, loop: ModalSystem, offse
         The matrix of the mean loop, with its error radius.
     neutral
         The rigid modes over z.
-    loop, offsets
+    modal_system, offsets
         The modal system; the start of each subsystem in the state, and the number of states.
 
     Raises
@@ -385,7 +388,7 @@ def with_stored_values(matrix: Matrix, neutral: Floats, loop: ModalSystem, offse
     ApcError
         E806 no fractions satisfy the equation within its error bounds, as entries overflow.
     """
-    sizes = [len(group.z_names) for group in loop.subsystems]
+    sizes = [len(group.z_names) for group in modal_system.subsystems]
     state_indices = np.concatenate(
         [offset + np.arange(size) for offset, size in zip(offsets, sizes, strict=False)]
     )

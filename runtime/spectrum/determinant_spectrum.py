@@ -73,7 +73,10 @@ def solve_loops(loops: Sequence[ModalSystem]) -> Spectrum:
     loops
         The loops, each counted with its multiplicity.
     """
-    return _spectrum([_solve_loop(loop) for loop in loops], [loop.multiplicity for loop in loops])
+    return _spectrum(
+        [_solve_loop(modal_system) for modal_system in loops],
+        [modal_system.multiplicity for modal_system in loops],
+    )
 
 
 def radius_in_floats(loops: Sequence[ModalSystem]) -> float:
@@ -85,9 +88,11 @@ def radius_in_floats(loops: Sequence[ModalSystem]) -> float:
         The loops.
     """
     radii = []
-    for loop in loops:
-        function, _ = loop_characteristic(loop.subsystems, loop.coupling, loop.weight_errors)
-        rigid = len(find_rigid_modes(without_packets(loop), with_drifts=False).names)
+    for modal_system in loops:
+        function, _ = loop_characteristic(
+            modal_system.subsystems, modal_system.coupling, modal_system.weight_errors
+        )
+        rigid = len(find_rigid_modes(without_packets(modal_system), with_drifts=False).names)
         radii.append(largest_zero(function, _loop_starts(function), rigid=rigid))
     return float(np.max(radii))  # NaN if one is
 
@@ -148,10 +153,12 @@ def _spectrum(solved: Sequence[_SolvedSystem], multiplicities: Sequence[int]) ->
     return Spectrum(tuple(modes), radius, error, rigid, drifts, verdict, NO_PROOF, tuple(notes))
 
 
-def _solve_loop(loop: ModalSystem) -> _SolvedSystem:
+def _solve_loop(modal_system: ModalSystem) -> _SolvedSystem:
     """Return the zeros and the largest modes of a loop."""
-    function, members = loop_characteristic(loop.subsystems, loop.coupling, loop.weight_errors)
-    without_delays = without_packets(loop)
+    function, members = loop_characteristic(
+        modal_system.subsystems, modal_system.coupling, modal_system.weight_errors
+    )
+    without_delays = without_packets(modal_system)
     rigid, drifts = len(find_rigid_modes(without_delays, with_drifts=False).names), 0
     starts = _loop_starts(function)
     zeros = find_zeros(function, starts, rigid=rigid, listed=LISTED, near=0)
@@ -159,11 +166,12 @@ def _solve_loop(loop: ModalSystem) -> _SolvedSystem:
         rigid
         and np.isfinite(zeros.high)
         and not zeros.rigid_counted
-        and (drifts := find_rigid_modes(loop).drifts)
+        and (drifts := find_rigid_modes(modal_system).drifts)
     ):
         zeros = find_zeros(function, starts, rigid=rigid + drifts, listed=LISTED, near=0)
     modes = _with_conjugates(
-        _mode_of_zero(function, members, zero, loop.name, loop.multiplicity) for zero in zeros.zeros
+        _mode_of_zero(function, members, zero, modal_system.name, modal_system.multiplicity)
+        for zero in zeros.zeros
     )
     return _SolvedSystem(zeros, rigid, drifts, modes)
 

@@ -106,13 +106,13 @@ class StateLayout:
         return tuple(self.indices)
 
 
-def without_packets(loop: ModalSystem) -> ModalSystem:
+def without_packets(modal_system: ModalSystem) -> ModalSystem:
     """Return the loop without packets in its state: the number of rigid modes is independent of delays."""
     subsystems = tuple(
         replace(group, schedule=replace(group.schedule, depths=(0,) * len(group.schedule.depths)))
-        for group in loop.subsystems
+        for group in modal_system.subsystems
     )
-    return replace(loop, subsystems=subsystems)
+    return replace(modal_system, subsystems=subsystems)
 
 
 def lay_out(z_names: Sequence[Sequence[str]], schedules: Sequence[Schedule]) -> StateLayout:

@@ -76,10 +76,10 @@ def split(groups: Sequence[PeerClass], exchange: CommunicationGraph) -> tuple[Cl
         E801, E802 an undefined mean; E804 one system of too many states.
     """
     loops = decompose(groups, exchange).loops
-    for loop in loops:
-        if loop.states > MATRIX_STATES:
-            raise too_large(exchange, f"{exchange.peers:,} peers", loop.states)
-    return tuple(close_loop(loop) for loop in loops)
+    for modal_system in loops:
+        if modal_system.states > MATRIX_STATES:
+            raise too_large(exchange, f"{exchange.peers:,} peers", modal_system.states)
+    return tuple(close_loop(modal_system) for modal_system in loops)
 
 
 def decompose(groups: Sequence[PeerClass], exchange: CommunicationGraph) -> ModalDecomposition:
@@ -267,73 +267,75 @@ def _mode_family(subsystems: Sequence[PeerClass]) -> str:
     return COUPLED if len(subsystems) > 1 else "common" if subsystems[0].count > 1 else "single"
 
 
-def split_exchangeable(loop: ModalSystem, exchange: CommunicationGraph) -> tuple[ModalSystem, ...]:
+def split_exchangeable(modal_system: ModalSystem, exchange: CommunicationGraph) -> tuple[ModalSystem, ...]:
     """Return a loop split by its interchangeable peers.
 
     Parameters
     ----------
-    loop
+    modal_system
         A loop of all peers, one per subsystem, with exact weights; without interchangeable peers it is
         returned unchanged.
     exchange
         The links, for the names of the groups.
     """
     classes: list[list[int]] = []
-    for index in range(len(loop.subsystems)):
-        interchangeable = (members for members in classes if _are_exchangeable(loop, members[0], index))
+    for index in range(len(modal_system.subsystems)):
+        interchangeable = (
+            members for members in classes if _are_exchangeable(modal_system, members[0], index)
+        )
         matching_class = next(interchangeable, None)
         if matching_class is None:
             classes.append([index])
         else:
             matching_class.append(index)
-    if loop.weight_errors or len(classes) == len(loop.subsystems):
-        return (loop,)
+    if modal_system.weight_errors or len(classes) == len(modal_system.subsystems):
+        return (modal_system,)
     subsystems = tuple(
-        _merged_class([loop.subsystems[index] for index in members], exchange) for members in classes
+        _merged_class([modal_system.subsystems[index] for index in members], exchange) for members in classes
     )
     coupling = {
         coupling_term: tuple(
-            tuple(_class_weight(loop, coupling_term, members, others) for others in classes)
+            tuple(_class_weight(modal_system, coupling_term, members, others) for others in classes)
             for members in classes
         )
-        for coupling_term in loop.coupling
+        for coupling_term in modal_system.coupling
     }
-    loops = [replace(loop, name=_mode_family(subsystems), subsystems=subsystems, coupling=coupling)]
+    loops = [replace(modal_system, name=_mode_family(subsystems), subsystems=subsystems, coupling=coupling)]
     for subsystem, members in zip(subsystems, classes, strict=True):
         if len(members) > 1:
             first, second = members[:2]
             separation = {
                 coupling_term: ((rows[first][first] - rows[first][second],),)
-                for coupling_term, rows in loop.coupling.items()
+                for coupling_term, rows in modal_system.coupling.items()
             }
-            multiplicity = loop.multiplicity * (len(members) - 1)
+            multiplicity = modal_system.multiplicity * (len(members) - 1)
             loops.append(ModalSystem(f"difference {subsystem.name}", multiplicity, (subsystem,), separation))
     return tuple(loops)
 
 
-def _are_exchangeable(loop: ModalSystem, g: int, h: int) -> bool:
+def _are_exchangeable(modal_system: ModalSystem, g: int, h: int) -> bool:
     """Return whether an exchange of the subsystems g and h leaves the loop unchanged."""
-    subsystem, other = loop.subsystems[g], loop.subsystems[h]
+    subsystem, other = modal_system.subsystems[g], modal_system.subsystems[h]
     if subsystem.index != other.index:
         return False
-    remaining = [index for index in range(len(loop.subsystems)) if index not in (g, h)]
+    remaining = [index for index in range(len(modal_system.subsystems)) if index not in (g, h)]
     return all(
         rows[g][g] == rows[h][h]
         and rows[g][h] == rows[h][g]
         and all(rows[g][k] == rows[h][k] and rows[k][g] == rows[k][h] for k in remaining)
-        for rows in loop.coupling.values()
+        for rows in modal_system.coupling.values()
     )
 
 
 def _class_weight(
-    loop: ModalSystem, coupling_term: CouplingTerm, receivers: Sequence[int], senders: Sequence[int]
+    modal_system: ModalSystem, coupling_term: CouplingTerm, receivers: Sequence[int], senders: Sequence[int]
 ) -> Fraction:
     """Return the sum of the weights with which a subsystem receives all subsystems of a class.
 
     `receivers` and `senders` are the indices of the subsystems of two classes; all receivers of a class have
     the same sum.
     """
-    row = loop.coupling[coupling_term][receivers[0]]
+    row = modal_system.coupling[coupling_term][receivers[0]]
     return sum((row[index] for index in senders), Fraction(0))
 
 

@@ -48,22 +48,22 @@ def count_translations(numeric: NumericModel, populations: Sequence[Heterogeneou
     """
     groups = representatives(numeric)
     total = 0
-    for loop in complete_loops(groups, numeric.exchange):
-        free = len(find_rigid_modes(loop, with_drifts=False).names)
+    for modal_system in complete_loops(groups, numeric.exchange):
+        free = len(find_rigid_modes(modal_system, with_drifts=False).names)
         if free and not are_common_to_all_peers(
-            loop, [populations[group.index] for group in loop.subsystems]
+            modal_system, [populations[group.index] for group in modal_system.subsystems]
         ):
             return None
-        total += loop.multiplicity * free
+        total += modal_system.multiplicity * free
     return total
 
 
-def are_common_to_all_peers(loop: ModalSystem, populations: Sequence[HeterogeneousGroup]) -> bool:
+def are_common_to_all_peers(modal_system: ModalSystem, populations: Sequence[HeterogeneousGroup]) -> bool:
     """Return whether the rigid modes of a loop of representatives are those of all represented peers.
 
     Parameters
     ----------
-    loop
+    modal_system
         A loop whose subsystems are the representatives.
     populations
         The population of each subsystem.
@@ -71,10 +71,10 @@ def are_common_to_all_peers(loop: ModalSystem, populations: Sequence[Heterogeneo
     for index, population in enumerate(populations):
         if not (population.parameters != population.parameters[0]).any():
             continue  # every represented peer equals its representative
-        subsystems: list[LinearSubsystem | None] = [group.exact for group in loop.subsystems]
+        subsystems: list[LinearSubsystem | None] = [group.exact for group in modal_system.subsystems]
         subsystems[index] = _random_peer(population)
         linear_subsystems = [subsystem for subsystem in subsystems if subsystem is not None]
-        if len(linear_subsystems) < len(subsystems) or not stays_rigid(loop, linear_subsystems):
+        if len(linear_subsystems) < len(subsystems) or not stays_rigid(modal_system, linear_subsystems):
             return False
     return True
 

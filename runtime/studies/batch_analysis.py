@@ -377,17 +377,17 @@ def _shared_matrices(
             plan = make_plan(generic_model)
             if not plan.loops or len(plan.loops) > MOST_LOOPS or plan.method == "determinant":
                 return None
-            if max(loop.states for loop in plan.loops) > BATCH_STATES:
+            if max(modal_system.states for modal_system in plan.loops) > BATCH_STATES:
                 return None
             evaluator = batch_evaluator(timed_system, parameter_refs, plan.groups, generic_model.exchange)
     except ApcError:
         return None  # each point reports its own error
     rigid = drifts = 0
-    for loop, wiring in zip(plan.loops, evaluator.wirings, strict=True):
-        if wiring.modes_vary or (wiring.rigid.names and classify_neutral_modes(loop).unobservable):
+    for modal_system, wiring in zip(plan.loops, evaluator.wirings, strict=True):
+        if wiring.modes_vary or (wiring.rigid.names and classify_neutral_modes(modal_system).unobservable):
             return None
-        rigid += loop.multiplicity * len(wiring.rigid.names)
-        drifts += loop.multiplicity * wiring.rigid.drifts
+        rigid += modal_system.multiplicity * len(wiring.rigid.names)
+        drifts += modal_system.multiplicity * wiring.rigid.drifts
     names = {item.name: column for column, item in zip(columns, parameter_refs, strict=True)}
     all_parameters = (
         *timed_system.parameters,

@@ -196,7 +196,7 @@ def _loop_sizes(numeric: NumericModel, *, most: float) -> list[int]:
     # A bound by the states of one peer, without building loops.
     if events + max(map(states_of, schedules, numeric.subsystems)) ** 2 > most:
         return []
-    states = [loop.states for loop in decompose(*lifted_classes(numeric)).loops]
+    states = [modal_system.states for modal_system in decompose(*lifted_classes(numeric)).loops]
     return states if events + sum(state**2 for state in states) <= most else []
 
 

@@ -179,8 +179,8 @@ def _modes(numeric: NumericModel) -> tuple[list[LossMode], float]:
     }
     ratios, (weight, sizes) = ratios_of(loops[0].subsystems, lossy), weight_of(loops, lossy)
     modes = []
-    for loop in loops:
-        received_loop = packets.loop(loop, packet_numbers, depths)
+    for modal_system in loops:
+        received_loop = packets.loop(modal_system, packet_numbers, depths)
         error_bound = []
         for g, subsystem in enumerate(received_loop.subsystems):
             reception_of = dict[
@@ -195,7 +195,7 @@ def _modes(numeric: NumericModel) -> tuple[list[LossMode], float]:
                 first = min(lags.values())
                 error_bound.append((g, {input_row: lag - first for input_row, lag in lags.items()}, 1.0))
         response = change_of_sent(received_loop, error_bound, ratios, sizes)
-        lost_loop = packets.loop(loop, previous_packets, depths)
+        lost_loop = packets.loop(modal_system, previous_packets, depths)
         layout = lay_out_loop(lost_loop)
         maps, n = [subsystem.lifted for subsystem in lost_loop.subsystems], len(layout.names)
         states = len(response.coordinates.eliminated) + len(response.coordinates.rest)
@@ -210,7 +210,9 @@ def _modes(numeric: NumericModel) -> tuple[list[LossMode], float]:
             ):
                 matrix[:, index] = 0.0
                 matrix[0, index, index] = 1.0
-        modes.append(LossMode(loop.name, relative(matrix, response.coordinates, MIDPOINT_RADIUS), response))
+        modes.append(
+            LossMode(modal_system.name, relative(matrix, response.coordinates, MIDPOINT_RADIUS), response)
+        )
     return modes, weight
 
 

@@ -120,24 +120,24 @@ def hold_frame(model: Model, reception: PerTickReception, *, interchangeable: bo
     interchangeable
         Whether the peers are exchangeable.
     """
-    loop = dense_loop(reception.groups, reception.exchange)
-    memories = stored_of(model, reception, loop)
+    modal_system = dense_loop(reception.groups, reception.exchange)
+    memories = stored_of(model, reception, modal_system)
     links = {link.name: link for link in model.links}
     received_channels, loss_channels, laws = list[ReceivedChannel](), list[LossChannel](), list[ChannelLaw]()
     for number, memory in enumerate(memory for memory in memories if any(memory.sizes)):
         routes = [
             coupling_term
-            for coupling_term in loop.coupling
+            for coupling_term in modal_system.coupling
             if (coupling_term.link, coupling_term.delay) == memory.route
         ]
-        for g, h in itertools.product(range(len(loop.subsystems)), repeat=2):
-            weights = {coupling_term: loop.coupling[coupling_term][g][h] for coupling_term in routes}
+        for g, h in itertools.product(range(len(modal_system.subsystems)), repeat=2):
+            weights = {coupling_term: modal_system.coupling[coupling_term][g][h] for coupling_term in routes}
             if any(weights.values()):
                 received_channels.append(ReceivedChannel(g, memory.route, weights))
                 loss_channels.append((g, h, number))
                 laws.append(channel_law(model, links[memory.route[0]], memory.route[1]))
-    no_neutral_modes = np.zeros((sum(len(subsystem.z_names) for subsystem in loop.subsystems), 0))
-    means = mean_loop(loop, reception.of(loop), memories, received_channels, no_neutral_modes)
+    no_neutral_modes = np.zeros((sum(len(subsystem.z_names) for subsystem in modal_system.subsystems), 0))
+    means = mean_loop(modal_system, reception.of(modal_system), memories, received_channels, no_neutral_modes)
     matrix, first = value_of(means.matrix), means.offsets[-1]
     noise = [index for channel in means.channels for index in channel.noise]
     states = np.delete(np.arange(len(matrix)), noise)
@@ -157,9 +157,9 @@ def hold_frame(model: Model, reception: PerTickReception, *, interchangeable: bo
         reception_errors[c, : len(channel.noise)] = error[:, states]
     ends = np.cumsum([first, *(len(channel.stored) for channel in means.channels)]).tolist()
     stored = tuple(map(range, ends, ends[1:]))
-    neutral, loop_matrix = neutral_motions(loop), means.matrix[:, :first, :first]
+    neutral, loop_matrix = neutral_motions(modal_system), means.matrix[:, :first, :first]
     basis = np.zeros((len(states), neutral.shape[1]))
-    basis[:first] = with_stored_values(loop_matrix, neutral, loop, means.offsets)
+    basis[:first] = with_stored_values(loop_matrix, neutral, modal_system, means.offsets)
     mean, offsets = matrix[np.ix_(states, states)], means.offsets
     terms = tuple((coupling_term,) for coupling_term in loss_channels)
     return _projected(
@@ -201,8 +201,8 @@ def substitution_frame(
     The frame map is the sum over all outcomes of the product of their indicators times their transition
     matrix: the part without ν is A, and the factor of ν_S is F_S.
     """
-    loop = dense_loop(reception.groups, reception.exchange)
-    receivers, offsets, law = receivers_of(model, reception, loop, loop.coupling)
+    modal_system = dense_loop(reception.groups, reception.exchange)
+    receivers, offsets, law = receivers_of(model, reception, modal_system, modal_system.coupling)
     senders_of_peers = [np.flatnonzero(receiver.received.any(axis=0)).tolist() for receiver in receivers]
     loss_channels = [(h, g, 0) for h, senders in enumerate(senders_of_peers) for g in senders]
     if len(loss_channels) > most:
@@ -243,7 +243,7 @@ def substitution_frame(
                 noise_inputs[-1][rows, np.arange(size)] = 1.0
                 reception_errors[-1][:size] = term
     bounded_mean = np.stack([mean, np.full_like(mean, NEUTRAL)])
-    basis = with_stored_values(bounded_mean, neutral_motions(loop), loop, offsets)
+    basis = with_stored_values(bounded_mean, neutral_motions(modal_system), modal_system, offsets)
     parts = (
         tuple(terms),
         np.stack(noise_inputs),

@@ -137,11 +137,11 @@ class Packets:
         return depths
 
     def loop(
-        self, loop: ModalSystem, numbers: Mapping[UncertainSample, int], depths: Mapping[str, int]
+        self, modal_system: ModalSystem, numbers: Mapping[UncertainSample, int], depths: Mapping[str, int]
     ) -> ModalSystem:
         """Return a loop whose ticks receive the packets of the given numbers."""
         subsystems = []
-        for subsystem, rows in zip(loop.subsystems, self.reception.of(loop), strict=True):
+        for subsystem, rows in zip(modal_system.subsystems, self.reception.of(modal_system), strict=True):
             received = []
             for row in rows:
                 frames, slot = divmod(numbers[row], self.slots[row.coupling_term.link])
@@ -156,7 +156,7 @@ class Packets:
                     subsystem, schedule=replace(subsystem.schedule, received=tuple(received), depths=stored)
                 )
             )
-        return replace(loop, subsystems=tuple(subsystems))
+        return replace(modal_system, subsystems=tuple(subsystems))
 
 
 def trace_radius(numeric: NumericModel) -> TraceGrowth:
@@ -183,11 +183,13 @@ def trace_radius(numeric: NumericModel) -> TraceGrowth:
     received = {row: packets.received(row, trace=traces.get(row.coupling_term.link)) for row in packets.rows}
     depths = packets.depths((row, number) for row, numbers in received.items() for number in numbers)
     result = []
-    for loop in decompose(packets.reception.groups, packets.reception.exchange).loops:
-        stored = sum(depths[sent.link] for subsystem in loop.subsystems for sent in subsystem.schedule.sent)
-        if stored + sum(len(subsystem.z_names) for subsystem in loop.subsystems) > MATRIX_STATES:
+    for modal_system in decompose(packets.reception.groups, packets.reception.exchange).loops:
+        stored = sum(
+            depths[sent.link] for subsystem in modal_system.subsystems for sent in subsystem.schedule.sent
+        )
+        if stored + sum(len(subsystem.z_names) for subsystem in modal_system.subsystems) > MATRIX_STATES:
             raise NotSupportedError("the recorded delays exceed the supported length")
-        result.append(_period_growth(loop, packets, received, depths, frames))
+        result.append(_period_growth(modal_system, packets, received, depths, frames))
     low, high, radius, uncertainty = np.array(result).max(axis=0).tolist()
     return TraceGrowth(low, high, radius, uncertainty, frames)
 
@@ -198,7 +200,7 @@ def _frames_per_period(delays: int, slots: int) -> int:
 
 
 def _period_growth(
-    loop: ModalSystem,
+    modal_system: ModalSystem,
     packets: Packets,
     received: Mapping[UncertainSample, Sequence[int]],
     depths: Mapping[str, int],
@@ -209,7 +211,7 @@ def _period_growth(
 
     Parameters
     ----------
-    loop, packets
+    modal_system, packets
         The loop, and the packets of the model.
     received
         The packet in effect at each tick, frame by frame over a period.
@@ -218,14 +220,14 @@ def _period_growth(
     """
     frame_maps: dict[tuple[int, ...], Balls] = {}
     coordinates: Relative | None = None
-    rows = dict.fromkeys(row for loop_rows in packets.reception.of(loop) for row in loop_rows)
+    rows = dict.fromkeys(row for loop_rows in packets.reception.of(modal_system) for row in loop_rows)
     # The eigenvalues of a product are those of its halves in either order, with other roundings.
     halves: list[Balls] = []
     scale = 0
     for frame in range(frames):
         numbers = tuple(received[row][frame % len(received[row])] for row in rows)
         if numbers not in frame_maps:
-            frame_loop = packets.loop(loop, dict(zip(rows, numbers, strict=True)), depths)
+            frame_loop = packets.loop(modal_system, dict(zip(rows, numbers, strict=True)), depths)
             layout = lay_out_loop(frame_loop)
             maps = [subsystem.lifted for subsystem in frame_loop.subsystems]
             matrix = interconnect(

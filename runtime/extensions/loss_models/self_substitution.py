@@ -127,7 +127,7 @@ def self_substitution(model: Model, reception: PerTickReception) -> Moments:
         starts = np.cumsum([0, *(sizes[g] for g in peer_versus_rest.class_of)]).tolist()
         matrix = _mean_matrix(receivers, peer_versus_rest, starts)
         coordinates = relative_coordinates(
-            with_stored_values(matrix, peer_versus_rest.neutral, peer_versus_rest.loop, starts)
+            with_stored_values(matrix, peer_versus_rest.neutral, peer_versus_rest.modal_system, starts)
         )
         bounded, received_forms, shares = with_uncertainty(coordinates), [], []
         for subsystem, g in enumerate(peer_versus_rest.class_of):
@@ -291,7 +291,7 @@ def _mean_matrix(
     spans, matrix = list(map(slice, starts, starts[1:])), np.zeros((2, starts[-1], starts[-1]))
     for index, g in enumerate(peer_versus_rest.class_of):
         for sender, (h, subsystem) in enumerate(
-            zip(peer_versus_rest.class_of, peer_versus_rest.loop.subsystems, strict=True)
+            zip(peer_versus_rest.class_of, peer_versus_rest.modal_system.subsystems, strict=True)
         ):
             block = entrywise(
                 receivers[g].shares[h], rounded_number(float(subsystem.count - (sender == index)))
@@ -332,7 +332,9 @@ def _deviations(
         receiver.received[:, first_class],
         sum(
             subsystem.count
-            for subsystem, g in zip(peer_versus_rest.loop.subsystems, peer_versus_rest.class_of, strict=True)
+            for subsystem, g in zip(
+                peer_versus_rest.modal_system.subsystems, peer_versus_rest.class_of, strict=True
+            )
             if g == first_class
         )
         - (peer_versus_rest.class_of[index] == first_class),

@@ -91,7 +91,7 @@ def used_rows(subsystem: PeerClass, link: str) -> list[tuple[int, ReceivedSample
 
 
 def change_of_sent(
-    loop: ModalSystem,
+    modal_system: ModalSystem,
     error_bound: Sequence[tuple[int, Mapping[int, int], float]],
     ratios: Ratios,
     sizes: Sizes,
@@ -100,14 +100,14 @@ def change_of_sent(
 
     Parameters
     ----------
-    loop
+    modal_system
         A loop that stores each packet for at least one frame.
     error_bound
         The rows of r of a subsystem with a common error, their delays in frames, and their factors.
     ratios, sizes
         From `ratios_of` and `weight_of`.
     """
-    layout = lay_out_loop(loop)
+    layout = lay_out_loop(modal_system)
     if (n := len(layout.names)) > GAIN_BOUND_STATES:
         raise NotSupportedError(
             f"the peers form one system of {n:,} states; the limit is {GAIN_BOUND_STATES}"
@@ -115,14 +115,14 @@ def change_of_sent(
 
     def size(subsystem: int, link: str) -> float:
         """Return the norm of equal unit motions of a subsystem's n peers: √n, or weighted by scaling."""
-        return math.sqrt(loop.subsystems[subsystem].count) * sizes.get(
-            (link, loop.subsystems[subsystem].name), 1.0
+        return math.sqrt(modal_system.subsystems[subsystem].count) * sizes.get(
+            (link, modal_system.subsystems[subsystem].name), 1.0
         )
 
     channels = set()
     entering = []
     for g, lines, times in error_bound:
-        received = loop.subsystems[g].schedule.received[next(iter(lines))]
+        received = modal_system.subsystems[g].schedule.received[next(iter(lines))]
         channels.add((received.sent.link, received.sent.channel))
         # If several values are received as one combination, the first with a nonzero weight is the reference.
         if ratios.get((received.sent.link, received.sent.channel), 1) == 1:
@@ -131,7 +131,7 @@ def change_of_sent(
     starts = np.cumsum([n, *(max(lines.values()) for _, lines, _ in entering)]).tolist()
     states = starts[-1]
     feedback = []
-    for g, receives in enumerate(feedback_of(loop, layout)):
+    for g, receives in enumerate(feedback_of(modal_system, layout)):
         before = np.zeros((*receives.delayed.shape[:2], states + len(entering)))
         before[..., :n] = receives.delayed
         for index, (subsystem, lines, share) in enumerate(entering):
@@ -140,11 +140,11 @@ def change_of_sent(
                 before[:, packet_row, at] = share, 8 * UNIT_ROUNDOFF * share
         feedback.append(InterconnectionMatrices(receives.direct, before))
     closed = interconnect(
-        [subsystem.lifted for subsystem in loop.subsystems], feedback, layout, numbers=MIDPOINT_RADIUS
+        [subsystem.lifted for subsystem in modal_system.subsystems], feedback, layout, numbers=MIDPOINT_RADIUS
     )
     senders = [
         (h, row, sent)
-        for h, subsystem in enumerate(loop.subsystems)
+        for h, subsystem in enumerate(modal_system.subsystems)
         for row, sent in enumerate(subsystem.schedule.sent)
     ]
     indices = {(packet.subsystem, packet.row, packet.lag): index for packet, index in layout.indices.items()}
@@ -164,7 +164,7 @@ def change_of_sent(
     for index, (start, end) in enumerate(itertools.pairwise(starts)):
         for at in range(start, end):
             matrix[0, at, at - 1 if at > start else states + index] = 1.0
-    basis = find_rigid_modes(loop, with_drifts=False).basis
+    basis = find_rigid_modes(modal_system, with_drifts=False).basis
     coordinates = relative_coordinates(np.concatenate([basis, np.zeros((states - n, basis.shape[1]))]))
     bounded_coordinates = with_uncertainty(coordinates)
     return Response(
@@ -232,16 +232,16 @@ def weight_of(loops: Sequence[ModalSystem], lossy: frozenset[str]) -> tuple[floa
     for link in sorted(lossy):
         used_terms = {
             received.coupling_term
-            for loop in loops
-            for subsystem in loop.subsystems
+            for modal_system in loops
+            for subsystem in modal_system.subsystems
             for _, received in used_rows(subsystem, link)
         }
-        for loop in loops if len(loops[0].subsystems) == 1 else loops[:1]:
-            count = np.array([subsystem.count for subsystem in loop.subsystems], np.float64)
+        for modal_system in loops if len(loops[0].subsystems) == 1 else loops[:1]:
+            count = np.array([subsystem.count for subsystem in modal_system.subsystems], np.float64)
             blocks = [
-                (np.abs(np.array(rows, np.float64)) + loop.weight_errors.get(coupling_term, 0.0))
+                (np.abs(np.array(rows, np.float64)) + modal_system.weight_errors.get(coupling_term, 0.0))
                 * np.sqrt(count[:, None] / count)
-                for coupling_term, rows in loop.coupling.items()
+                for coupling_term, rows in modal_system.coupling.items()
                 if coupling_term in used_terms
             ]
             if not blocks:
@@ -249,7 +249,7 @@ def weight_of(loops: Sequence[ModalSystem], lossy: frozenset[str]) -> tuple[floa
             units = _units(np.sum(blocks, axis=0))
             sizes |= {
                 (link, subsystem.name): unit
-                for subsystem, unit in zip(loop.subsystems, units.tolist(), strict=True)
+                for subsystem, unit in zip(modal_system.subsystems, units.tolist(), strict=True)
             }
             scaled = np.concatenate([units[:, None] * block / units for block in blocks])
             largest = max(largest, float(np.linalg.norm(scaled, 2)))

@@ -104,9 +104,9 @@ def _loop_gain(numeric: NumericModel, delay: ParameterRef, low: Fraction, high: 
         if row.coupling_term.delay == delay.name
     }
     gains = []
-    for loop in loops:
-        nominal_loop = packets.loop(loop, received, packets.depths(received.items(), 1))
-        rows = reception.of(loop)
+    for modal_system in loops:
+        nominal_loop = packets.loop(modal_system, received, packets.depths(received.items(), 1))
+        rows = reception.of(modal_system)
         error_bound = [
             (g, {line: 0}, spread[rows[g][line]])
             for g, subsystem in enumerate(nominal_loop.subsystems)

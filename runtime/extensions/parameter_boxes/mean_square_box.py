@@ -105,8 +105,8 @@ def prove_mean_square(model: Model, ranges: Sequence[Range], *, cells: int | Non
     """
     with single_threaded(), np.errstate(all="ignore"):
         problem = _box_problem(model, ranges)
-        for loop in (separation.loop for separation in problem.classes.loops):
-            loop_without_packets = without_packets(loop)
+        for modal_system in (separation.modal_system for separation in problem.classes.loops):
+            loop_without_packets = without_packets(modal_system)
             if not stays_rigid(
                 loop_without_packets,
                 [
@@ -115,8 +115,8 @@ def prove_mean_square(model: Model, ranges: Sequence[Range], *, cells: int | Non
                 ],
             ):
                 note = (
-                    f"{loop.name}: a rigid mode has a direction that depends on the parameters, so no box "
-                    "can be proved"
+                    f"{modal_system.name}: a rigid mode has a direction that depends on the parameters, "
+                    "so no box can be proved"
                 )
                 return RobustStability(model.name, tuple(ranges), UNDECIDED, None, 0, 1.0, (), (note,))
         is_unstable = partial(_is_unstable, problem)

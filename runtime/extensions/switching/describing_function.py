@@ -122,4 +122,6 @@ def _spectrum(
 ) -> Spectrum:
     """Return the spectrum of the model with linear contacts of a reduced stiffness."""
     scaled_groups = [with_gain(group, forces, Fraction(gain)) for group, forces in groups]
-    return solve_spectrum([close_loop(loop) for loop in decompose(scaled_groups, exchange).loops])
+    return solve_spectrum(
+        [close_loop(modal_system) for modal_system in decompose(scaled_groups, exchange).loops]
+    )

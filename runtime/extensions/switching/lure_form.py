@@ -196,12 +196,12 @@ def lure_plants(numeric: NumericModel) -> list[LurePlant]:
     cut_of_class = {item.group.index: item for item in cut_classes}
     loops = orthogonal_loops([item.group for item in cut_classes], numeric.exchange, LURE_STATES)
     result = []
-    for loop in loops:
-        cut_groups = [cut_of_class[subsystem.index] for subsystem in loop.subsystems]
-        size = loop.states + sum(len(cut_classes.ticks) for cut_classes in cut_groups)
+    for modal_system in loops:
+        cut_groups = [cut_of_class[subsystem.index] for subsystem in modal_system.subsystems]
+        size = modal_system.states + sum(len(cut_classes.ticks) for cut_classes in cut_groups)
         if size > LURE_STATES:
             raise NotSupportedError(f"{size:,} coupled states and contact ticks; the limit is {LURE_STATES}")
-        result.append(_lure_plant(loop, cut_groups))
+        result.append(_lure_plant(modal_system, cut_groups))
     return result
 
 
@@ -235,27 +235,30 @@ def _cut_peers(group: PeerClass, forces: Sequence[SectorNonlinearity]) -> CutPee
     )
 
 
-def _lure_plant(loop: ModalSystem, cut_classes: Sequence[CutPeers]) -> LurePlant:
+def _lure_plant(modal_system: ModalSystem, cut_classes: Sequence[CutPeers]) -> LurePlant:
     """Return a closed loop with cut contacts.
 
     Raises NotSupportedError with the reason if the form does not exist.
     """
-    rigid = find_rigid_modes(close_loop(loop))
+    rigid = find_rigid_modes(close_loop(modal_system))
     if rigid.drifts:
         raise NotSupportedError("with all contacts open, a rigid-body motion grows without bound")
     names = [
         (*cut_peers.group.z_names, *(f"{part}[{tick}]" for part, tick in cut_peers.ticks))
         for cut_peers in cut_classes
     ]
-    layout = lay_out(names, [subsystem.schedule for subsystem in loop.subsystems])
+    layout = lay_out(names, [subsystem.schedule for subsystem in modal_system.subsystems])
     closed = interconnect_with_inputs(
-        loop,
+        modal_system,
         [cut_peers.map for cut_peers in cut_classes],
         [len(cut_peers.ticks) for cut_peers in cut_classes],
         layout,
         numbers=MIDPOINT_RADIUS,
     ).matrix
-    n, placed = len(layout.names), list(zip(loop.subsystems, cut_classes, layout.offsets, strict=True))
+    n, placed = (
+        len(layout.names),
+        list(zip(modal_system.subsystems, cut_classes, layout.offsets, strict=True)),
+    )
     port_rows = np.concatenate(
         [offset + cut_peers.states + np.arange(len(cut_peers.ticks)) for _, cut_peers, offset in placed]
     )
@@ -287,7 +290,7 @@ def _lure_plant(loop: ModalSystem, cut_classes: Sequence[CutPeers]) -> LurePlant
             drift = rounded(first_motion[None].astype(np.float64))
             drift_input = MIDPOINT_RADIUS.multiply(drift, MIDPOINT_RADIUS.multiply(left_vectors, b))
     return LurePlant(
-        name=loop.name,
+        name=modal_system.name,
         a=relative_rows(a[..., coordinates.rest], coordinates, MIDPOINT_RADIUS),
         b=relative_rows(b, coordinates, MIDPOINT_RADIUS),
         c=negated(c[..., coordinates.rest]),
