@@ -219,10 +219,10 @@ def _delay_independent_strip(
         family, inside, np.array([parameter_of(segment.inside, parameter_ref).value]), 0, low, high
     )
     result = search(path)
-    if not result.stable or any(edge.proof == ESTIMATE for edge in result.edges):
+    if not result.stable or any(item.proof == ESTIMATE for item in result.crossings):
         return None
     arcs, heights = [], [0.0]
-    for crossing in result.edges:
+    for crossing in result.crossings:
         height = min(max((crossing.value - low) / (high - low), 0.0), 1.0)
         heights.append(height)
         # The stable side is on the left: below for a line towards smaller delays, above for one towards

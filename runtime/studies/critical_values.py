@@ -258,7 +258,7 @@ def critical(
         value=relevant.value if relevant else None,
         error=relevant.error if relevant else None,
         stable_side=relevant.stable_side if relevant else None,
-        crossings=result.edges,
+        crossings=result.crossings,
         searched_to=result.searched_to,
         cell=CELL,
         complete=result.complete,
@@ -475,13 +475,13 @@ def _relevant_crossing(
 
     The verdict at a jump decides the side of a present value there.
     """
-    if not search.edges:
+    if not search.crossings:
         return None
-    below = sum(edge.boundary < current for edge in search.edges)
-    not_above = sum(edge.boundary <= current for edge in search.edges)
+    below = sum(crossing.boundary < current for crossing in search.crossings)
+    not_above = sum(crossing.boundary <= current for crossing in search.crossings)
     if not_above > below and search.stable[below] != stable_now():
         below = not_above
     if search.stable[below]:
-        return search.edges[below] if below < len(search.edges) else search.edges[below - 1]
-    losses = [edge for edge in search.edges if edge.stable_side == "below"]
-    return losses[0] if losses else search.edges[0]
+        return search.crossings[below] if below < len(search.crossings) else search.crossings[below - 1]
+    losses = [crossing for crossing in search.crossings if crossing.stable_side == "below"]
+    return losses[0] if losses else search.crossings[0]

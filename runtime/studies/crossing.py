@@ -200,7 +200,7 @@ class SingleSegment:
 class CrossingReport:
     """All crossings along one parameter in an interval, with the verdicts between them.
 
-    `edges` are the crossings in order, and `stable` the verdicts of the intervals between them, one more than
+    `crossings` are in order, and `stable` holds the verdicts of the intervals between them, one more than
     there are crossings; empty if no sample has a verdict. `evaluations` is the number of evaluations;
     `complete` is False if an eigenvalue is so near to the circle that some cell could not be resolved;
     `has_effect` states whether an eigenvalue changed, or the path has several segments; `classified` whether
@@ -209,7 +209,7 @@ class CrossingReport:
     from that at all neighbouring values: for example a stiffness of 0.
     """
 
-    edges: tuple[Crossing, ...]
+    crossings: tuple[Crossing, ...]
     stable: tuple[bool, ...]
     searched_to: tuple[float, float]
     complete: bool
@@ -270,21 +270,21 @@ def stable_in_all(searches: Sequence[CrossingReport]) -> CrossingReport:
         if not report.stable and (report.undecided or not report.complete):
             return report  # undecided at every value
     decided = [report for report in searches if report.stable]
-    ordered_edges = sorted(
-        ((edge.value, n, edge) for n, report in enumerate(decided) for edge in report.edges),
+    ordered_crossings = sorted(
+        ((crossing.value, n, crossing) for n, report in enumerate(decided) for crossing in report.crossings),
         key=itemgetter(0, 1),
     )
     interval_of = [0] * len(decided)
-    edges: list[Crossing] = []
+    crossings: list[Crossing] = []
     stable = [all(report.stable[0] for report in decided)] if decided else []
-    for _, n, edge in ordered_edges:
+    for _, n, crossing in ordered_crossings:
         interval_of[n] += 1
         all_stable = all(report.stable[index] for report, index in zip(decided, interval_of, strict=True))
         if all_stable is not stable[-1]:
-            edges.append(edge)
+            crossings.append(crossing)
             stable.append(all_stable)
     return CrossingReport(
-        edges=tuple(edges),
+        crossings=tuple(crossings),
         stable=tuple(stable),
         searched_to=(
             max(report.searched_to[0] for report in searches),
@@ -312,7 +312,7 @@ def search(path: ParameterPath, *, first: bool = False, progress: Progress | Non
     progress
         Receives the progress of the search.
     """
-    edges: list[Crossing] = []
+    crossings: list[Crossing] = []
     stable: list[bool] = []
     undecided: list[tuple[float, float]] = []
     ends: list[float] = []
@@ -345,7 +345,7 @@ def search(path: ParameterPath, *, first: bool = False, progress: Progress | Non
         stable_at = (samples.log_radius < 0).tolist()
         if stable and stable[-1] != stable_at[0]:
             assert previous is not None, "a verdict comes from a segment"
-            edges.append(path.change(previous, segment, stable_below=stable[-1]))
+            crossings.append(path.change(previous, segment, stable_below=stable[-1]))
         if not stable or stable[-1] != stable_at[0]:
             stable.append(stable_at[0])
         for index in range(len(stable_at) - 1):
@@ -360,16 +360,16 @@ def search(path: ParameterPath, *, first: bool = False, progress: Progress | Non
                     half_width=FIRST_HALF if first else HALF,
                 )
                 if crossing is not None:
-                    edges.append(crossing)
+                    crossings.append(crossing)
                     stable.append(stable_at[index + 1])
                     if first and crossing.stable_side == "below":
                         break
         previous = segment
-        if why or (first and any(edge.stable_side == "below" for edge in edges)):
+        if why or (first and any(item.stable_side == "below" for item in crossings)):
             break
     searched_to = (ends[0], ends[-1]) if ends else (math.nan, math.nan)
     return CrossingReport(
-        edges=tuple(edges),
+        crossings=tuple(crossings),
         stable=tuple(stable),
         searched_to=searched_to,
         complete=complete,

@@ -305,7 +305,7 @@ def _margin(
         return None
     present = value_now(model, parameter_ref)
     row = replace(not_evaluated(model, parameter_ref, ""), searched_to=search.searched_to[1])
-    crossing = next((edge for edge in search.edges if edge.stable_side == "below"), None)
+    crossing = next((item for item in search.crossings if item.stable_side == "below"), None)
     if crossing is None and search.stable[:1] == (False,):
         # Stable at the present value, and unstable at every larger value.
         return replace(row, value=present, error=0.0, gain_margin=1.0 if present else None, kind="jump")
@@ -378,8 +378,8 @@ def network_margins(numeric: NumericModel, nominal: Margins, *, quick: bool = Fa
             rows.append(_margin(model, item, result, pointwise=True))
             if rows[-1] and result.why:
                 ended_early.setdefault(result.why, []).append(item.label)
-            if rows[-1] and result.edges and result.edges[0].proof != BOUNDED[MEAN_SQUARE]:
-                open_sides.append(f"{item.label} ({result.edges[0].proof})")
+            if rows[-1] and result.crossings and result.crossings[0].proof != BOUNDED[MEAN_SQUARE]:
+                open_sides.append(f"{item.label} ({result.crossings[0].proof})")
     notes = [f"{', '.join(labels)}: search ended, {why}" for why, labels in ended_early.items()]
     if open_sides:
         notes.append(f"without bounds on both sides: {', '.join(open_sides)}")

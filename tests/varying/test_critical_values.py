@@ -523,14 +523,14 @@ class Known(SingleSegment):
 
 def test_a_crossing_on_an_end_of_a_cell_is_held_from_both_sides() -> None:
     for value in (10.0, 50.0):
-        (one,) = search(Known(lambda at, value=value: 1 + (at - value) / 1e3, band=1e-12)).edges
+        (one,) = search(Known(lambda at, value=value: 1 + (at - value) / 1e3, band=1e-12)).crossings
         assert abs(one.value - value) <= one.error < 1e-8 and one.proof != ESTIMATE
 
 
 def test_a_first_loss_of_stability_next_to_a_sample_is_held_from_both_sides() -> None:
     """The sample at 10 is unstable by less than any analysis decides: it is no end of the bracket."""
     found = search(Known(lambda at: 1 + (at - 10) / 1e3 + 2e-11, band=1e-10, slow=True), first=True)
-    (one,) = found.edges
+    (one,) = found.crossings
     assert abs(one.value - 10) <= one.error < 1e-6 and one.proof != ESTIMATE
 
 
@@ -543,18 +543,18 @@ def test_a_search_for_the_first_loss_of_stability_evaluates_no_later_crossing() 
     # Zeros of a cubic: stability is lost at 5, regained at 30 and lost again at 70.
     path = Known(lambda at: 1 + (at - 5) * (at - 30) * (at - 70) / 1e7, slow=False)
     found = search(path, first=True)
-    assert [one.value for one in found.edges] == pytest.approx([5.0], rel=1e-9)
+    assert [one.value for one in found.crossings] == pytest.approx([5.0], rel=1e-9)
     assert {one for one in path.judged if 10 < one < 99} == {50.0}  # a first sample
-    assert [one.value for one in search(path).edges] == pytest.approx([5.0, 30.0, 70.0], rel=1e-9)
+    assert [one.value for one in search(path).crossings] == pytest.approx([5.0, 30.0, 70.0], rel=1e-9)
 
 
 def test_an_end_that_stands_alone_is_no_crossing() -> None:
     found = search(Known(lambda at: 0.5 if at == 0 else 2.0 + at))
-    assert (found.edges, found.stable, found.isolated) == ((), (False,), (0.0,))
+    assert (found.crossings, found.stable, found.isolated) == ((), (False,), (0.0,))
     # The same at the other end; and a crossing next to an end is one.
     found = search(Known(lambda at: 2.0 if at == 100 else 0.5))
-    assert (found.edges, found.stable, found.isolated) == ((), (True,), (100.0,))
-    (one,) = search(Known(lambda at: 0.9 + at)).edges
+    assert (found.crossings, found.stable, found.isolated) == ((), (True,), (100.0,))
+    (one,) = search(Known(lambda at: 0.9 + at)).crossings
     assert one.value == pytest.approx(0.1, rel=1e-10)
 
 
@@ -563,20 +563,20 @@ def test_no_error_is_wider_than_1e_6_where_analyses_that_near_decide(half: float
     """No analysis decides within `half` of the limit, relative to it: all decide at 1e-6 of it."""
     limit, slope = 33.3, 0.01
     band = math.expm1(slope * limit * half)
-    (one,) = search(Known(lambda at: math.exp(slope * (at - limit)), band=band)).edges
+    (one,) = search(Known(lambda at: math.exp(slope * (at - limit)), band=band)).crossings
     assert abs(one.value - limit) <= one.error <= 1e-6 * one.value
 
 
 @pytest.mark.parametrize(("slope", "band"), [(1e-3, 1e-7), (14 / 33.3, 1e-5), (-14 / 33.3, 1e-5)])
 def test_a_bracket_is_narrowed_to_the_values_that_no_analysis_decides(slope: float, band: float) -> None:
     """The radius is undecided within `band` of 1, so that no bracket is narrower than 2 `band` / `slope`."""
-    (one,) = search(Known(lambda at: math.exp(slope * (at - 33.3)), band=band)).edges
+    (one,) = search(Known(lambda at: math.exp(slope * (at - 33.3)), band=band)).crossings
     assert one.kind == "crossing"
     assert abs(one.value - 33.3) <= one.error <= 1.6 * band / abs(slope)
 
 
 def test_a_jump_between_values_is_held_by_bisection() -> None:
-    (one,) = search(Known(lambda at: 0.5 if at < 33.3 else 2.0)).edges
+    (one,) = search(Known(lambda at: 0.5 if at < 33.3 else 2.0)).crossings
     assert abs(one.value - 33.3) <= one.error < 1e-9
 
 
