@@ -344,7 +344,7 @@ def _analyze(side: Side, *, method: str, certify: bool, exact_work: float) -> An
         proof = replace(proof, scope=tuple(scope for scope, applies in scopes if applies))
     return Analysis(
         topology=model.name,
-        peers=numeric.exchange.peers,
+        peers=numeric.comm_graph.peers,
         frame_s=float(numeric.schedules[0].frame_s),
         states_per_peer=max(map(states_of, numeric.schedules, numeric.subsystems)),
         method=plan.method,
@@ -385,7 +385,7 @@ def _spectrum(
         spectrum = _solve_determinant(plan.loops)
         matrices_fit = all(modal_system.states <= MATRIX_STATES for modal_system in plan.loops)
         if method == "auto" and spectrum.stable is None and matrices_fit:
-            decomposed = decompose(plan.groups, numeric.exchange)
+            decomposed = decompose(plan.groups, numeric.comm_graph)
             plan = replace(plan, method=decomposed.method, notes=decomposed.notes)
             spectrum = _solve_closed(model, plan.loops, certify=certify, exact_work=exact_work)
     else:
@@ -494,7 +494,7 @@ def _solve_populations(numeric: NumericModel) -> tuple[Spectrum, tuple[Note, ...
 
     peers = populations(numeric)
     rigid = count_translations(numeric, peers)
-    spectrum = solve_populations(peers, numeric.exchange, rigid=rigid or 0)
+    spectrum = solve_populations(peers, numeric.comm_graph, rigid=rigid or 0)
     note = "the first peer has a rigid mode that other peers lack; the rigid modes are undecided"
     return spectrum, () if rigid is not None else (note,)
 
@@ -510,4 +510,4 @@ def lifted_classes(
         As `method_selection.refuse_varying` and `peer_classes.classes_of_peers`.
     """
     refuse_varying(numeric.model, numeric.jacobians)
-    return classes_of_peers(numeric), numeric.exchange
+    return classes_of_peers(numeric), numeric.comm_graph

@@ -110,7 +110,7 @@ def make_plan(numeric: NumericModel, method: str = "auto") -> AnalysisPlan:
         E804 a system of too many states for its matrix, E850 a method that is not applicable; and the errors
         of `refuse_varying` and `peer_classes.classes_of_peers`.
     """
-    model, exchange = numeric.model, numeric.exchange
+    model, comm_graph = numeric.model, numeric.comm_graph
     if method not in METHODS or method == PAPER:
         raise cannot_serve(model, method, f"available methods: {', '.join(METHODS)}")
     refuse_varying(model, numeric.jacobians)
@@ -118,24 +118,26 @@ def make_plan(numeric: NumericModel, method: str = "auto") -> AnalysisPlan:
     if populations_allowed and (
         (method == "determinant" and _is_short_and_complete(numeric)) or has_more_states(numeric, FEW_STATES)
     ):
-        sparse = incomplete_links(numeric.schedules, exchange)
+        sparse = incomplete_links(numeric.schedules, comm_graph)
         if not sparse:
             return _plan_populations(numeric)
         if method == "determinant":
             reason = f"the peers differ and are not completely connected over {sparse[0]}"
             raise cannot_serve(model, method, reason)
     groups = classes_of_peers(numeric)
-    if is_large_ring(groups, exchange):
-        message = f"a ring of {exchange.peers:,} peers has as many subsystems; the limit is {LARGEST_RING:,}"
+    if is_large_ring(groups, comm_graph):
+        message = (
+            f"a ring of {comm_graph.peers:,} peers has as many subsystems; the limit is {LARGEST_RING:,}"
+        )
         raise ApcError(
-            Diagnostic("E804", SourceLocation(exchange.topology), message, fix=f"count: {LARGEST_RING}")
+            Diagnostic("E804", SourceLocation(comm_graph.topology), message, fix=f"count: {LARGEST_RING}")
         )
     if method == "dense":
-        refuse_dense(groups, exchange)
-        loops: tuple[ModalSystem, ...] = (dense_loop(groups, exchange),)
+        refuse_dense(groups, comm_graph)
+        loops: tuple[ModalSystem, ...] = (dense_loop(groups, comm_graph),)
         chosen_method, notes = "dense", tuple[str, ...]()
     else:
-        decomposed = decompose(groups, exchange)
+        decomposed = decompose(groups, comm_graph)
         if method == "modes" and decomposed.method != "modes":
             raise cannot_serve(model, method, decomposed.notes[0])
         loops, chosen_method, notes = decomposed.loops, decomposed.method, decomposed.notes
@@ -162,7 +164,7 @@ def make_plan(numeric: NumericModel, method: str = "auto") -> AnalysisPlan:
         for modal_system in loops:
             if modal_system.states > MATRIX_STATES:
                 raise too_large(
-                    exchange, f"{exchange.peers:,} peers", modal_system.states, auto=method == "auto"
+                    comm_graph, f"{comm_graph.peers:,} peers", modal_system.states, auto=method == "auto"
                 )
         needed_bytes = (
             CACHE_SIZE * sum(modal_system.states**2 for modal_system in loops)
@@ -178,7 +180,7 @@ def make_plan(numeric: NumericModel, method: str = "auto") -> AnalysisPlan:
     refuse_beyond(
         needed_bytes,
         "E804",
-        SourceLocation(exchange.topology),
+        SourceLocation(comm_graph.topology),
         message,
         "reduce the number of different peers or of states",
     )
@@ -193,13 +195,13 @@ def _long_lines(schedule: Schedule) -> bool:
     return packets > max(LONG_LINES, MANY_FRAMES * len(schedule.sent))
 
 
-def is_large_ring(groups: Sequence[PeerClass], exchange: CommunicationGraph) -> bool:
+def is_large_ring(groups: Sequence[PeerClass], comm_graph: CommunicationGraph) -> bool:
     """Return whether all peers are equal and form one ring of more than LARGEST_RING peers."""
     coupling_terms = used_coupling_terms(group.schedule for group in groups)
-    shapes = {exchange.links[coupling_term.link].graph.shape for coupling_term in coupling_terms}
-    if len(groups) > 1 or shapes != {"ring"} or exchange.peers <= LARGEST_RING:
+    shapes = {comm_graph.links[coupling_term.link].graph.shape for coupling_term in coupling_terms}
+    if len(groups) > 1 or shapes != {"ring"} or comm_graph.peers <= LARGEST_RING:
         return False
-    return not common_graph(coupling_terms, exchange)
+    return not common_graph(coupling_terms, comm_graph)
 
 
 def cannot_serve(model: Model, method: str, reason: str) -> ApcError:
@@ -241,7 +243,7 @@ def not_populations(model: Model, jacobians: Sequence[SubsystemJacobians]) -> st
 
 def _is_short_and_complete(numeric: NumericModel) -> bool:
     """Return whether peers differ, all graphs are complete, and at most LONG_LINES packets are in transit."""
-    complete = not incomplete_links(numeric.schedules, numeric.exchange)
+    complete = not incomplete_links(numeric.schedules, numeric.comm_graph)
     short = max(sum(schedule.depths) for schedule in numeric.schedules) <= LONG_LINES
     return complete and short and sum(map(len, numeric.numbers.parameters)) > 1
 
@@ -249,7 +251,7 @@ def _is_short_and_complete(numeric: NumericModel) -> bool:
 def _plan_populations(numeric: NumericModel) -> AnalysisPlan:
     """Return the plan for many different peers on complete graphs: one determinant of all sent values."""
     rows = {
-        (numeric.exchange.delay_class(index), sent)
+        (numeric.comm_graph.delay_class(index), sent)
         for index, schedule in enumerate(numeric.schedules)
         for sent in schedule.sent
     }

@@ -186,7 +186,7 @@ def _interchangeable(
     numeric: NumericModel, origins: Sequence[int], pieces: Sequence[tuple[LinearPiece, ...]]
 ) -> list[list[int]]:
     """Return the indices of groups in classes whose members may exchange their sides."""
-    complete = all(map(numeric.exchange.is_complete, numeric.exchange.links))
+    complete = all(map(numeric.comm_graph.is_complete, numeric.comm_graph.links))
     classes: dict[object, list[int]] = {}
     for n, origin in enumerate(origins):
         parameters = numeric.numbers.parameters[n].tobytes()
@@ -204,13 +204,13 @@ def _combination_name(
     `pieces` are the linear pieces of each group at the start, `texts` the side of each group, empty without a
     kink.
     """
-    groups, starts = numeric.model.groups, numeric.exchange.starts
+    groups, starts = numeric.model.groups, numeric.comm_graph.starts
     totals: Counter[str] = Counter()
     peers: dict[tuple[str, str], list[str]] = {}
     for group, text, first_peer in zip(groups, texts, starts[:-1].tolist(), strict=True):
         totals[group.name] += group.count
         if text:
-            peers.setdefault((group.name, text), []).append(numeric.exchange.peer_name(first_peer))
+            peers.setdefault((group.name, text), []).append(numeric.comm_graph.peer_name(first_peer))
     kinked = {group.name for group, group_pieces in zip(groups, pieces, strict=True) if len(group_pieces) > 1}
     words = []
     for (name, text), peer_names in peers.items():
@@ -235,7 +235,7 @@ def _pieces_of_groups(numeric: NumericModel, near: Sequence[bool]) -> list[tuple
     result: list[list[tuple[LinearPiece, ...]]] = [[] for _ in near]
     for class_index, peers in enumerate(classes):
         # A class of equal start values may contain peers of several groups.
-        groups = {numeric.exchange.group_of(run.start) for run in peers.runs}
+        groups = {numeric.comm_graph.group_of(run.start) for run in peers.runs}
         subsystem = starting.subsystems[class_index]
         if not any(near[group] for group in groups):
             continue

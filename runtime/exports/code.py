@@ -61,10 +61,10 @@ def peer_code(model: Model, *, peer: str = "", device: str = "", method: str = "
     chosen_method, plan = _plan(model, method)
     if not peer and len(set(subsystems_of(plan))) > 1:
         message = "the peers differ; C code is written for one peer"
-        fix = f'--peer "{plan.exchange.peer_name(0)}"'
+        fix = f'--peer "{plan.comm_graph.peer_name(0)}"'
         raise ApcError(Diagnostic("E963", SourceLocation(model.origin.topology), message, fix=fix))
     result = peer_of(
-        plan, number_of(plan.exchange, peer, "--peer") if peer else 0, chosen_method, device=device or None
+        plan, number_of(plan.comm_graph, peer, "--peer") if peer else 0, chosen_method, device=device or None
     )
     return Code(model.name, result, str(chosen_method))
 
@@ -73,7 +73,7 @@ def topology_unit(model: Model, *, peer: str = "", method: str = "") -> FmuConte
     """Return an FMU of a model, or of one peer of the model; parameters and errors as for `peer_code`."""
     chosen_method, plan = _plan(with_external_force(model), method)
     topology = (
-        single_peer(plan, number_of(plan.exchange, peer, "--peer"), chosen_method)
+        single_peer(plan, number_of(plan.comm_graph, peer, "--peer"), chosen_method)
         if peer
         else c_topology(plan, chosen_method)
     )

@@ -173,8 +173,8 @@ def state_space(model: Model, *, open_at: str = "") -> StateSpace:
     ApcError
         E950 no such link or coupler; E951 too many states; and those of `analysis.lifted_classes`.
     """
-    groups, exchange = peers_of(numeric_model(model))
-    (a, b, c, d), (states, inputs, outputs), unpushed = lifted(model, groups, exchange, open_at, IN_FLOATS)
+    groups, comm_graph = peers_of(numeric_model(model))
+    (a, b, c, d), (states, inputs, outputs), unpushed = lifted(model, groups, comm_graph, open_at, IN_FLOATS)
     if not all(np.isfinite(block).all() for block in (a, b, c, d)):
         raise ApcError(Diagnostic("E806", SourceLocation(model.name), TOO_LARGE))
     frame_s, notes = description(model)
@@ -223,7 +223,7 @@ def made_by(model: Model) -> str:
 def lifted(
     model: Model,
     groups: Sequence[PeerClass],
-    exchange: CommunicationGraph,
+    comm_graph: CommunicationGraph,
     open_at: str,
     numbers: FrameNumbers,
 ) -> tuple[Blocks, tuple[Labels, Labels, Labels], tuple[str, ...]]:
@@ -233,7 +233,7 @@ def lifted(
     ----------
     model, open_at
         As for `state_space`.
-    groups, exchange
+    groups, comm_graph
         The peers and the communication graph, from `analysis.lifted_classes`.
     numbers
         The numerical parts of the frame.
@@ -242,7 +242,7 @@ def lifted(
         link = _link_of(model, open_at)
         driven_peers = [_open_loop(model, group, "" if link else open_at, numbers) for group in groups]
         _check_size(model, driven_peers)
-        modal_system = dense_loop([item.group for item in driven_peers], exchange)
+        modal_system = dense_loop([item.group for item in driven_peers], comm_graph)
         peers_of_class = {item.group.index: item for item in driven_peers}
         subsystems = [peers_of_class[subsystem.index] for subsystem in modal_system.subsystems]
         blocks, labels = _closed(

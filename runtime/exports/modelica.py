@@ -49,7 +49,7 @@ from apc.parameter_values.parameters import resolve
 from apc.result import Result
 from apc.simulation.trajectory import texts_of
 from apc.support.distribution import program_version
-from apc.timing.communication_graph import CommunicationGraph, build_exchange, check_mean
+from apc.timing.communication_graph import CommunicationGraph, build_comm_graph, check_mean
 
 # The largest number of received terms and variables in a file; Modelica tools flatten each of them.
 MOST_TERMS = 20_000
@@ -106,7 +106,7 @@ class _ModelicaWriter:
     def __init__(self, model: Model) -> None:
         self.model = model
         self.numbers = resolve(model)
-        self.exchange: CommunicationGraph = build_exchange(model, self.numbers.timings)
+        self.comm_graph: CommunicationGraph = build_comm_graph(model, self.numbers.timings)
         timing = self.numbers.timings
         self.grids = {clock.name: (timing[clock.period], timing[clock.phase]) for clock in model.clocks}
         self.clock_of = {link.name: link.clock for link in model.links}
@@ -114,7 +114,7 @@ class _ModelicaWriter:
         self.parameters: dict[str, tuple[Text, str]] = {}
         self.declared: list[str] = []
         self.equations: list[str] = []
-        _refuse_unsupported(model, self.exchange)
+        _refuse_unsupported(model, self.comm_graph)
         self.clocks, self.clock_lines = self._clocks()
         self.named: dict[Any, Text] = {}  # variables that are declared once and used several times
         self.sent: dict[tuple[int, str], list[tuple[Text, str]]] = {}  # sent values, with their channels
@@ -267,7 +267,7 @@ class _ModelicaWriter:
         """
         sends_at = self.clock_of[link]
         value, name = self.sent[sender, link][channel]
-        label = f"{self.exchange.peer_name(sender)}.{name}"
+        label = f"{self.comm_graph.peer_name(sender)}.{name}"
         delayed_label = f"{label} after {float(delay) * 1e3:.6g} ms"
         (slow, first), (fast, second) = self.grids[sends_at], self.grids[clock]
         if first == second and delay % slow == 0:
@@ -354,11 +354,11 @@ class _Peer:
 
     def __init__(self, writer: _ModelicaWriter, number: int, group: int) -> None:
         self.writer, self.number, self.group = writer, number, writer.model.groups[group]
-        model, numbers, exchange = writer.model, writer.numbers, writer.exchange
-        self.peer_type, self.name = model.peer_types[self.group.peer_type], exchange.peer_name(number)
-        self.role = exchange.delay_class(group)
+        model, numbers, comm_graph = writer.model, writer.numbers, writer.comm_graph
+        self.peer_type, self.name = model.peer_types[self.group.peer_type], comm_graph.peer_name(number)
+        self.role = comm_graph.delay_class(group)
         rows = numbers.parameters[group]
-        self.vector = rows[numbers.rows[group][number - int(exchange.starts[group])]].tolist()
+        self.vector = rows[numbers.rows[group][number - int(comm_graph.starts[group])]].tolist()
         described = {parameter.name: parameter for parameter in model.parameters}
         begins = {state.start for state in self.peer_type.states}
         self.p: list[Text] = []
@@ -444,11 +444,11 @@ class _Peer:
 
     def _received(self, receive: Receive, clock: str, inside: Sequence[Any], t: Sequence[Any]) -> Text:
         """Return the variable of a receive: the reduction of all received values."""
-        writer, link, exchange = self.writer, receive.link, self.writer.exchange
+        writer, link, comm_graph = self.writer, receive.link, self.writer.comm_graph
         terms, weights, unit = [], [], NONE
-        for sender, inexact in received_by(writer.model, exchange, link, self.number):
-            weight, role = exact_weight(inexact), exchange.delay_class(exchange.group_of(sender))
-            timing = exchange.delay(link, role, self.role)
+        for sender, inexact in received_by(writer.model, comm_graph, link, self.number):
+            weight, role = exact_weight(inexact), comm_graph.delay_class(comm_graph.group_of(sender))
+            timing = comm_graph.delay(link, role, self.role)
             received = [
                 functools.partial(writer.received, sender, link, channel, timing, clock)
                 for channel in range(len(writer.sent[sender, link]))
@@ -462,7 +462,7 @@ class _Peer:
         total = sum(weights, Fraction(0))
         if receive.operator in ("mean", "max", "min"):
             divided = total if receive.operator == "mean" else Fraction(1)
-            check_mean(exchange, self.number, link, receive.operator, bool(terms), divided)
+            check_mean(comm_graph, self.number, link, receive.operator, bool(terms), divided)
         if receive.operator in ("max", "min"):
             joined = "{}({}, {})".format
             value = functools.reduce(
@@ -478,7 +478,7 @@ class _Peer:
         return writer.let(f"{self.name}.{receive.name}", value or "0", unit)
 
 
-def _refuse_unsupported(model: Model, exchange: CommunicationGraph) -> None:
+def _refuse_unsupported(model: Model, comm_graph: CommunicationGraph) -> None:
     """Raise ApcError E955 for constructs that Modelica equations cannot express."""
     for _, law in unreliable(model):
         message = f"{chance(law)}: random packet loss or delay"
@@ -500,10 +500,10 @@ def _refuse_unsupported(model: Model, exchange: CommunicationGraph) -> None:
                     f"the nonlinear loop of {peer_type.name} that Newton's method solves for {message[:120]}"
                 )
                 raise _refused(model, solved, "use a coupler without an algebraic loop")
-    peers = exchange.peers
+    peers = comm_graph.peers
     terms = sum(
-        peers * (peers - 1) if exchange.is_complete(link) else len(exchange.arcs(link)[0])
-        for link in exchange.links
+        peers * (peers - 1) if comm_graph.is_complete(link) else len(comm_graph.arcs(link)[0])
+        for link in comm_graph.links
     )
     if max(terms, peers) > MOST_TERMS:
         message = f"{peers:,} peers with {terms:,} directed connections"

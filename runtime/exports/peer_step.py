@@ -212,10 +212,10 @@ def peer_of(
         E960 the peer is not finite arithmetic, or has no ticks; E961 no device, or one that cannot be
         separated.
     """
-    model, group = plan.model, plan.exchange.group_of(number)
+    model, group = plan.model, plan.comm_graph.group_of(number)
     index = model.groups[group].peer_type
     peer_type, subsystem, schedule = model.peer_types[index], plan.subsystems[index], plan.schedules[group]
-    vector, label = _parameters(plan, number), plan.exchange.peer_name(number)
+    vector, label = _parameters(plan, number), plan.comm_graph.peer_name(number)
     _refuse_iterations(model, label, peer_type)
     outside = _external_states(model, label, subsystem, vector, device)
     instants, lengths = _instants(schedule)
@@ -248,8 +248,8 @@ def peer_of(
 
 def _parameters(plan: SimulationPlan, number: int) -> Any:
     """Return the parameters (n_p,) of a peer."""
-    group = plan.exchange.group_of(number)
-    row = plan.numbers.rows[group][number - int(plan.exchange.starts[group])]
+    group = plan.comm_graph.group_of(number)
+    row = plan.numbers.rows[group][number - int(plan.comm_graph.starts[group])]
     return plan.numbers.parameters[group][int(row)]
 
 
@@ -287,13 +287,13 @@ def subsystems_of(plan: SimulationPlan) -> tuple[int, ...]:
     """Return, for each peer, the first peer of its group with equal parameters and weights."""
     first: dict[Any, int] = {}
     numbers = []
-    graphs = [link for link in plan.exchange.links if not plan.exchange.is_complete(link)]
-    for number in range(plan.exchange.peers):
+    graphs = [link for link in plan.comm_graph.links if not plan.comm_graph.is_complete(link)]
+    for number in range(plan.comm_graph.peers):
         received = tuple(
-            tuple(weight for _, weight in received_by(plan.model, plan.exchange, link, number))
+            tuple(weight for _, weight in received_by(plan.model, plan.comm_graph, link, number))
             for link in graphs
         )
-        key = plan.exchange.group_of(number), _parameters(plan, number).tobytes(), received
+        key = plan.comm_graph.group_of(number), _parameters(plan, number).tobytes(), received
         numbers.append(first.setdefault(key, number))
     return tuple(numbers)
 
@@ -521,7 +521,7 @@ def lines_of(
     plan: SimulationPlan, number: int
 ) -> tuple[tuple[PeerLink, ...], dict[tuple[int, int], tuple[int, ...]]]:
     """Return the links of a peer, and for each receive the indices of its channels in the packet."""
-    model, exchange, group = plan.model, plan.exchange, plan.exchange.group_of(number)
+    model, comm_graph, group = plan.model, plan.comm_graph, plan.comm_graph.group_of(number)
     subsystem, schedule = plan.subsystems[model.groups[group].peer_type], plan.schedules[group]
     peer_type = subsystem.peer_type
     read = {
@@ -533,7 +533,9 @@ def lines_of(
     }
     lines: list[PeerLink] = []
     indices: dict[tuple[int, int], tuple[int, ...]] = {}
-    for name, (link, declared) in zip(prefixed("link", exchange.links), exchange.links.items(), strict=True):
+    for name, (link, declared) in zip(
+        prefixed("link", comm_graph.links), comm_graph.links.items(), strict=True
+    ):
         sent = {sent.channel for sent in schedule.sent if sent.link == link}
         channels_by_receive = {
             key: subsystem.pattern.ticks[key[0]].channels[key[1]]
@@ -557,9 +559,9 @@ def lines_of(
         }
         channels = tuple(send_partition.channels[i] for i in used_channels)
         members = prefixed("value", channels)
-        senders = [*received_by(plan.model, plan.exchange, link, number)] if receives else []
+        senders = [*received_by(plan.model, plan.comm_graph, link, number)] if receives else []
         if len(senders) > MOST_RECEIVED:
-            message = f"{exchange.peer_name(number)} receives from {len(senders):,} peers over {link}"
+            message = f"{comm_graph.peer_name(number)} receives from {len(senders):,} peers over {link}"
             message = f"{message}; the limit of the C export is {MOST_RECEIVED:,}"
             raise refused(model, message, advice="reduce the number of peers, or use a sparse graph")
         lines.append(
@@ -572,12 +574,15 @@ def lines_of(
                 sending=index if sent else -1,
                 senders=tuple(
                     Sender(
-                        sender, exchange.peer_name(sender), weight, first_packet(plan, link, sender, channels)
+                        sender,
+                        comm_graph.peer_name(sender),
+                        weight,
+                        first_packet(plan, link, sender, channels),
                     )
                     for sender, weight in senders
                 ),
                 missing=bool(senders) and any(channel.on_loss == "zero" for channel in declared.channels),
-                complete=exchange.is_complete(link),
+                complete=comm_graph.is_complete(link),
             )
         )
     return tuple(lines), indices
@@ -585,7 +590,7 @@ def lines_of(
 
 def first_packet(plan: SimulationPlan, link: str, number: int, channels: Sequence[str]) -> tuple[float, ...]:
     """Return the values used for a sender before its first packet arrives, one per channel."""
-    subsystem = plan.subsystems[plan.model.groups[plan.exchange.group_of(number)].peer_type]
+    subsystem = plan.subsystems[plan.model.groups[plan.comm_graph.group_of(number)].peer_type]
     sent: dict[str, float] = {}
     for sending in subsystem.peer_type.sends:
         if sending.link == link:
@@ -597,18 +602,18 @@ def first_packet(plan: SimulationPlan, link: str, number: int, channels: Sequenc
 
 
 def received_by(
-    model: Model, exchange: CommunicationGraph, link: str, number: int
+    model: Model, comm_graph: CommunicationGraph, link: str, number: int
 ) -> Iterator[tuple[int, float]]:
     """Yield the senders to a peer over a link, with their weights, in the order of peers."""
-    if exchange.is_complete(link):
-        senders = [(index, 1.0) for index in range(exchange.peers) if index != number]
+    if comm_graph.is_complete(link):
+        senders = [(index, 1.0) for index in range(comm_graph.peers) if index != number]
     else:
-        pairs, weights = exchange.arcs(link)
+        pairs, weights = comm_graph.arcs(link)
         own_rows = np.flatnonzero(pairs[:, 1] == number)
         senders = sorted(zip(pairs[own_rows, 0].tolist(), weights[own_rows].tolist(), strict=True))
     peer_types = [model.peer_types[group.peer_type] for group in model.groups]
     sends = [any(sending.link == link for sending in peer_type.sends) for peer_type in peer_types]
-    return ((sender, weight) for sender, weight in senders if sends[exchange.group_of(sender)])
+    return ((sender, weight) for sender, weight in senders if sends[comm_graph.group_of(sender)])
 
 
 def instant_functions(peer_type: PeerType) -> list[tuple[Any, str, str, str]]:

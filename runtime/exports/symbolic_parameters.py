@@ -76,18 +76,18 @@ def state_space_of(model: Model, *, open_at: str = "", symbolic: Sequence[str] =
     if numeric is None:
         message = "the point of linearization depends on more than the parameters"
         raise ApcError(Diagnostic("E954", SourceLocation(OPTION), message, advice=f"omit {OPTION}"))
-    groups, exchange = peers_of(numeric)
-    groups = tuple(part for group in groups for part in _split_by_groups(group, exchange))
+    groups, comm_graph = peers_of(numeric)
+    groups = tuple(part for group in groups for part in _split_by_groups(group, comm_graph))
     values = dict(zip(parameter_refs, symbols, strict=True))
 
     def vector(group: PeerClass) -> Any:
         """Return the parameters of a group's first peer as CasADi expressions."""
-        index = exchange.group_of(group.peers.first)
-        peer = group.peers.first - int(exchange.starts[index])
+        index = comm_graph.group_of(group.peers.first)
+        peer = group.peers.first - int(comm_graph.starts[index])
         entries = free_values(model, model.groups[index], peer, values, symbolic_function)
         return casadi.vertcat(*map(casadi.SX, entries))
 
-    blocks, _, _ = lifted(model, groups, exchange, open_at, _numbers(vector))
+    blocks, _, _ = lifted(model, groups, comm_graph, open_at, _numbers(vector))
     function = casadi.Function(
         "state_space", symbols, [*map(_matrix, blocks)], words(ports), ["A", "B", "C", "D"]
     )
@@ -117,9 +117,9 @@ def _parameter_refs(model: Model, names: Sequence[str]) -> list[ParameterRef]:
     return parameter_refs
 
 
-def _split_by_groups(group: PeerClass, exchange: CommunicationGraph) -> list[PeerClass]:
+def _split_by_groups(group: PeerClass, comm_graph: CommunicationGraph) -> list[PeerClass]:
     """Return a class of equal peers split by the model's groups, as a parameter of one group may be free."""
-    runs = itertools.groupby(group.peers.runs, key=lambda run: exchange.group_of(run.start))
+    runs = itertools.groupby(group.peers.runs, key=lambda run: comm_graph.group_of(run.start))
     parts = [PeerIndices(tuple(runs_of_group)) for _, runs_of_group in runs]
     return [replace(group, peers=peers, count=len(peers)) for peers in parts]
 

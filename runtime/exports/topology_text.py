@@ -159,19 +159,23 @@ def c_topology(plan: SimulationPlan, method: Method) -> CTopology:
     ApcError
         E960 too many directed peer pairs; and as `peer_of`, `arrival_process_of`.
     """
-    model, exchange = plan.model, plan.exchange
-    total = exchange.peers * (exchange.peers - 1) if any(map(exchange.is_complete, exchange.links)) else 0
-    if max(total, exchange.peers) > MOST_ARCS:
+    model, comm_graph = plan.model, plan.comm_graph
+    total = (
+        comm_graph.peers * (comm_graph.peers - 1) if any(map(comm_graph.is_complete, comm_graph.links)) else 0
+    )
+    if max(total, comm_graph.peers) > MOST_ARCS:
         message = (
-            f"{exchange.peers:,} peers have {total:,} directed connections; the limit of the C export "
+            f"{comm_graph.peers:,} peers have {total:,} directed connections; the limit of the C export "
             f"is {MOST_ARCS:,}"
         )
-        alone = f'--peer "{exchange.peer_name(0)}"' if exchange.peers <= MOST_RECEIVED else ""
+        alone = f'--peer "{comm_graph.peer_name(0)}"' if comm_graph.peers <= MOST_RECEIVED else ""
         raise refused(model, message, alone)
     first = subsystems_of(plan)
     subsystems = [*dict.fromkeys(first)]
     # The index of a subsystem keeps `a[1]` and `A[1]` distinct, and `a_1_link_b` of a link and a peer.
-    names = [f"site{k}_{identifier(exchange.peer_name(subsystem))}" for k, subsystem in enumerate(subsystems)]
+    names = [
+        f"site{k}_{identifier(comm_graph.peer_name(subsystem))}" for k, subsystem in enumerate(subsystems)
+    ]
     codes = tuple(
         peer_of(plan, subsystem, method, name=name) for subsystem, name in zip(subsystems, names, strict=True)
     )
@@ -185,7 +189,7 @@ def c_topology(plan: SimulationPlan, method: Method) -> CTopology:
         variable
         for k, (subsystem, index) in enumerate(peers)
         for variable in _variables_of(
-            codes[subsystem], f"peer{subsystem}[{index}]", f"{exchange.peer_name(k)}."
+            codes[subsystem], f"peer{subsystem}[{index}]", f"{comm_graph.peer_name(k)}."
         )
     ]
     variables.sort(key=lambda variable: not variable.given)
@@ -195,23 +199,23 @@ def c_topology(plan: SimulationPlan, method: Method) -> CTopology:
 
 def _links(plan: SimulationPlan, quantum: Fraction) -> tuple[CLink, ...]:
     """Return the links of a model in C, with times in quanta and delays in seconds."""
-    exchange, timings = plan.exchange, plan.numbers.timings
+    comm_graph, timings = plan.comm_graph, plan.numbers.timings
     used: dict[str, dict[str, None]] = {}
     arcs: dict[str, list[tuple[int, int]]] = {}
-    for peer in range(exchange.peers):
+    for peer in range(comm_graph.peers):
         for line in lines_of(plan, peer)[0]:
             used.setdefault(line.link, {}).update(dict.fromkeys(line.channels))
             arcs.setdefault(line.link, []).extend((sender.peer, peer) for sender in line.senders)
     clocks = {clock.name: clock for clock in plan.model.clocks}
     links = []
     for name, (link, channels) in zip(prefixed("link", used), used.items(), strict=True):
-        names = [exchange.delay(link, *map(exchange.group_of, arc)) for arc in arcs[link]]
+        names = [comm_graph.delay(link, *map(comm_graph.group_of, arc)) for arc in arcs[link]]
         delays, distinct = [timings[name] for name in names], [*dict.fromkeys(names)]
-        declared = exchange.links[link]
+        declared = comm_graph.links[link]
         clock = clocks[declared.clock]
         period, phase = (int(timings[text] / quantum) for text in (clock.period, clock.phase))
         arrival_processes = [
-            (arrival_process_of(plan.model, timings, exchange, route, quantum), route)
+            (arrival_process_of(plan.model, timings, comm_graph, route, quantum), route)
             for route in plan.routes
             if route.link == link
         ]
@@ -227,7 +231,7 @@ def _links(plan: SimulationPlan, quantum: Fraction) -> tuple[CLink, ...]:
                 phase=phase,
                 channels=tuple(channels),
                 ring=max(latest // period + 2, stored + 1),
-                start=tuple(first_packet(plan, link, peer, [*channels]) for peer in range(exchange.peers)),
+                start=tuple(first_packet(plan, link, peer, [*channels]) for peer in range(comm_graph.peers)),
                 arcs=tuple(arcs[link]),
                 delays=tuple(delays),
                 arrival_process=arrival_processes[0][0] if arrival_processes else None,

@@ -121,7 +121,7 @@ def port_loops(numeric: NumericModel, *, option: str) -> tuple[PortLoop, ...]:
         The reason why no device is ever passive.
     """
     model = numeric.model
-    groups, exchange = lifted_classes(numeric)
+    groups, comm_graph = lifted_classes(numeric)
     location, unit_of = (
         SourceLocation(model.origin.topology),
         {parameter.name: parameter.unit for parameter in model.parameters},
@@ -157,8 +157,8 @@ def port_loops(numeric: NumericModel, *, option: str) -> tuple[PortLoop, ...]:
     if not device_inputs:
         raise no_device(model, option)
     used = {received.coupling_term.link for group in groups for received in group.schedule.received}
-    is_orthogonal = all(exchange.links[link].graph.shape in ORTHOGONAL for link in used)
-    loops, weighted = accepted_loops(with_inputs, exchange, lambda _: is_orthogonal, option)
+    is_orthogonal = all(comm_graph.links[link].graph.shape in ORTHOGONAL for link in used)
+    loops, weighted = accepted_loops(with_inputs, comm_graph, lambda _: is_orthogonal, option)
     result = []
     for modal_system in loops:
         # A loop without devices is one of the model with its devices clamped.

@@ -185,7 +185,7 @@ def transparency(
         h2 = norms.h2_gains(model, response) if norms and is_stable and "h2" in alongside else ()
     linear = is_linear(numeric)
     driven_name, other_name = (
-        f"{response.exchange.peer_name(item.peer)}.{device.part}"
+        f"{response.comm_graph.peer_name(item.peer)}.{device.part}"
         for item, device in ((port, response.device), (other, response.other))
     )
     directions = [

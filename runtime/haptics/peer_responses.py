@@ -69,7 +69,7 @@ def responses(numeric: NumericModel, port: DevicePort, other: DevicePort) -> Res
         E931 a peer without a device; E933 a model too large.
     """
     model = numeric.model
-    groups, exchange = lifted_classes(numeric)
+    groups, comm_graph = lifted_classes(numeric)
     unit_of = {parameter.name: parameter.unit for parameter in model.parameters}
     direct = coupled_directly(model.peer_types)
     driven_classes, subsystems, gripped = [], {}, {}
@@ -91,7 +91,7 @@ def responses(numeric: NumericModel, port: DevicePort, other: DevicePort) -> Res
         driven_classes.append(peer_group)
         subsystems[peer_group.index] = subsystem
     plain, driven_loops = (
-        accepted_loops(classes, exchange, _are_by_class, "apc transparency")[0]
+        accepted_loops(classes, comm_graph, _are_by_class, "apc transparency")[0]
         for classes in (groups, driven_classes)
     )
     common = driven_loops[0]
@@ -116,7 +116,7 @@ def responses(numeric: NumericModel, port: DevicePort, other: DevicePort) -> Res
         if number and modal_system.subsystems[0].name == name
     ]
     return Responses(
-        exchange=exchange,
+        comm_graph=comm_graph,
         device=gripped[port],
         other=gripped[other],
         loops=tuple(driven_mode(modal_system, subsystems) for modal_system in driven_loops),
@@ -198,10 +198,10 @@ class Responses:
     of each class; `plain` are the same loops without inputs. A class is a subsystem of the first loop, and
     represents `members` peers; `local` is the index of the driven peer's class, `unpaired` the index of its
     difference loop, None for a single peer; `to` is the index of the other peer's class; `same` states
-    whether both are one peer. `exchange` is the communication graph.
+    whether both are one peer. `comm_graph` is the communication graph.
     """
 
-    exchange: CommunicationGraph
+    comm_graph: CommunicationGraph
     device: Device
     other: Device
     loops: tuple[DrivenMode, ...]

@@ -26,7 +26,7 @@ from apc.compiler.compiled import ClockPartition, Model, PeerType, Receive, Send
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.multiples import common_multiple
 from apc.linearization.jacobians import SubsystemJacobians, jacobians
-from apc.timing.communication_graph import CommunicationGraph, build_exchange
+from apc.timing.communication_graph import CommunicationGraph, build_comm_graph
 from apc.timing.schedule import ORDER
 
 # Cached peer types with the ages of given timings.
@@ -108,11 +108,11 @@ def nominal(
         return model
     if timings is None:
         timings = {timing.name: timing.value for timing in model.timings}
-    exchange = build_exchange(model, timings)
+    comm_graph = build_comm_graph(model, timings)
     peer_types = []
     for number, peer_type in enumerate(model.peer_types):
         partitions = [
-            _ages_of_ticks(model, exchange, timings, number, clock, order) for clock in peer_type.clocks
+            _ages_of_ticks(model, comm_graph, timings, number, clock, order) for clock in peer_type.clocks
         ]
         peer_types.append(
             _with_known_ages(peer_type, tuple(partitions)) if _receives_ages(peer_type) else peer_type
@@ -122,7 +122,7 @@ def nominal(
 
 def _ages_of_ticks(
     model: Model,
-    exchange: CommunicationGraph,
+    comm_graph: CommunicationGraph,
     timings: Mapping[str, Fraction],
     peer_type_index: int,
     partition: ClockPartition,
@@ -132,7 +132,7 @@ def _ages_of_ticks(
 
     Parameters
     ----------
-    model, exchange, timings
+    model, comm_graph, timings
         The compiled model, its communication graph, and seconds by the name of the timing.
     peer_type_index, partition
         The index of the peer type, and its clock partition.
@@ -145,9 +145,9 @@ def _ages_of_ticks(
     clock_of = {clock.name: clock for clock in model.clocks}
     delay_by_link, clock_by_link = dict[str, Fraction](), dict[str, str]()
     for link in links:
-        delay_name = _single_delay(model, exchange, timings, peer_type_index, link)
+        delay_name = _single_delay(model, comm_graph, timings, peer_type_index, link)
         delay_by_link[link] = timings[delay_name]
-        clock_by_link[link] = exchange.links[link].clock_at(delay_name)
+        clock_by_link[link] = comm_graph.links[link].clock_at(delay_name)
     names = [partition.clock, *clock_by_link.values()]
     period = {name: timings[clock_of[name].period] for name in names}
     phase = {name: timings[clock_of[name].phase] % period[name] for name in names}
@@ -162,7 +162,7 @@ def _ages_of_ticks(
             waited = (time - delay_by_link[link] - phase[clock]) % period[
                 clock
             ]  # since the newest available packet
-            is_after = exchange.links[link].after and delay_by_link[link] == 0
+            is_after = comm_graph.links[link].after and delay_by_link[link] == 0
             if not waited and (is_after or rank("tick") < rank("deliver")):
                 waited = period[clock]
             ages.append((link, delay_by_link[link] + waited + missed))
@@ -172,7 +172,7 @@ def _ages_of_ticks(
 
 def _single_delay(
     model: Model,
-    exchange: CommunicationGraph,
+    comm_graph: CommunicationGraph,
     timings: Mapping[str, Fraction],
     peer_type_index: int,
     link: str,
@@ -186,13 +186,13 @@ def _single_delay(
     """
     receivers = [index for index, group in enumerate(model.groups) if group.peer_type == peer_type_index]
     delay_names = {
-        exchange.delay(link, sender, receiver)
+        comm_graph.delay(link, sender, receiver)
         for receiver in receivers
         for sender in range(len(model.groups))
         if sender != receiver or model.groups[sender].count > 1
     }
-    delay_names = delay_names or {exchange.default_delay[link]}
-    if len({(timings[name], exchange.links[link].clock_at(name)) for name in delay_names}) > 1:
+    delay_names = delay_names or {comm_graph.default_delay[link]}
+    if len({(timings[name], comm_graph.links[link].clock_at(name)) for name in delay_names}) > 1:
         names = ", ".join(sorted(delay_names))
         message = (
             f"the age of samples received by {model.peer_types[peer_type_index].name} over {link} differs "

@@ -80,16 +80,16 @@ def classes_of_equals(numeric: ModelNumbers) -> list[PeerIndices]:
     ApcError
         E804 too many different peers.
     """
-    exchange, numbers = numeric.exchange, numeric.numbers
-    complete = all(map(exchange.is_complete, exchange.links))
+    comm_graph, numbers = numeric.comm_graph, numeric.numbers
+    complete = all(map(comm_graph.is_complete, comm_graph.links))
     result, unknowns = [], 0
     for index, group in enumerate(numeric.model.groups):
-        start, count = int(exchange.starts[index]), len(numbers.parameters[index])
+        start, count = int(comm_graph.starts[index]), len(numbers.parameters[index])
         different = count if complete else group.count
         unknowns += different * len(start_parameters(numeric.model.peer_types[group.peer_type]))
         if unknowns > MOST_UNKNOWNS:
             message = f"the equilibrium of different peers has more than {MOST_UNKNOWNS:,} unknowns"
-            location = SourceLocation(exchange.topology)
+            location = SourceLocation(comm_graph.topology)
             raise ApcError(Diagnostic("E804", location, message, advice="use fewer different peers"))
         if different == 1:
             result.append(PeerIndices((range(start, start + group.count),)))
@@ -201,11 +201,11 @@ class EquilibriumEquations:
 
     def prefixes(self) -> list[str]:
         """Return the peer or group of each class, as the start of a name; "" for a single class."""
-        exchange, groups = self.numeric.exchange, self.starting.groups
+        comm_graph, groups = self.numeric.comm_graph, self.starting.groups
         if len(groups) == 1:
             return [""]
         return [
-            f"{exchange.groups[group] if groups.count(group) == 1 else exchange.peer_name(peers.first)}."
+            f"{comm_graph.groups[group] if groups.count(group) == 1 else comm_graph.peer_name(peers.first)}."
             for group, peers in zip(groups, self.classes, strict=True)
         ]
 
@@ -214,7 +214,7 @@ class EquilibriumEquations:
         subsystem = self.starting.subsystems[g]
         x, u, memories = start_values(subsystem, self.parameters[g])
         names = [
-            f"{self.numeric.exchange.peer_name(self.starting.peers[g])}.{state.name}"
+            f"{self.numeric.comm_graph.peer_name(self.starting.peers[g])}.{state.name}"
             for state in subsystem.peer_type.states
         ]
         x = [given.get(name, value) for name, value in zip(names, x, strict=True)]

@@ -33,10 +33,10 @@ class StartClasses:
     """
 
     def __init__(self, numeric: ModelNumbers, classes: Sequence[PeerIndices]) -> None:
-        self.exchange = exchange = numeric.exchange
+        self.comm_graph = comm_graph = numeric.comm_graph
         self.counts = list(map(len, classes))
         self.peers = [peers.first for peers in classes]
-        self.groups = list(map(exchange.group_of, self.peers))
+        self.groups = list(map(comm_graph.group_of, self.peers))
         self.vectors = list(map(numeric.vector, self.peers))
         self.peer_types = [numeric.model.groups[group].peer_type for group in self.groups]
         self.subsystems = [numeric.subsystems[group] for group in self.groups]
@@ -53,10 +53,10 @@ class StartClasses:
             self.sent.append(exact[key][1])
         class_of = {peer: g for g, peer in enumerate(self.peers)}
         self.arcs: dict[str, dict[int, list[tuple[int, Fraction]]]] = {}
-        for name in exchange.links:
-            if not exchange.is_complete(name) and len(class_of) == exchange.peers:
+        for name in comm_graph.links:
+            if not comm_graph.is_complete(name) and len(class_of) == comm_graph.peers:
                 receives: dict[int, list[tuple[int, Fraction]]] = {}
-                pairs, weights = exchange.arcs(name)
+                pairs, weights = comm_graph.arcs(name)
                 for (sender, receiver), weight in zip(pairs.tolist(), weights.tolist(), strict=True):
                     receives.setdefault(class_of[receiver], []).append(
                         (class_of[sender], exact_weight(weight))
@@ -138,7 +138,7 @@ class StartClasses:
         if operator != "mean":
             return Fraction(1)
         weight_sum = sum((weight for _, weight, _ in senders), Fraction(0))
-        check_mean(self.exchange, self.peers[g], link, operator, bool(senders), weight_sum)
+        check_mean(self.comm_graph, self.peers[g], link, operator, bool(senders), weight_sum)
         return weight_sum
 
     def _over_edges(
@@ -209,12 +209,14 @@ class StartClasses:
         ApcError
             E803 several senders have this value.
         """
-        check_mean(self.exchange, self.peers[g], link, operator, bool(senders), Fraction(1))
+        check_mean(self.comm_graph, self.peers[g], link, operator, bool(senders), Fraction(1))
         best = (max if operator == "max" else min)(values[h][0] for h, _, _ in senders)
         winners = [(h, number) for h, _, number in senders if values[h][0] == best]
         if sum(number for _, number in winners) > 1:
-            peer = self.exchange.peer_name(self.peers[g])
+            peer = self.comm_graph.peer_name(self.peers[g])
             message = f"{name} of {peer}: {operator} over peers with equal values has no linearization"
             advice = "use initial values that differ between peers"
-            raise ApcError(Diagnostic("E803", SourceLocation(self.exchange.topology), message, advice=advice))
+            raise ApcError(
+                Diagnostic("E803", SourceLocation(self.comm_graph.topology), message, advice=advice)
+            )
         return winners[0][0]

@@ -22,7 +22,7 @@ from apc.compiler.compiled import Model, count_of
 from apc.compiler.peer_counts import received_sums
 from apc.linearization.jacobians import SubsystemJacobians
 from apc.parameter_values.parameters import ResolvedNumbers, rationals, resolve
-from apc.timing.communication_graph import CommunicationGraph, build_exchange
+from apc.timing.communication_graph import CommunicationGraph, build_comm_graph
 from apc.timing.schedule import ORDER, Schedule
 from apc.timing.scheduling import build_schedules
 
@@ -102,9 +102,9 @@ class ModelNumbers:
         return resolve(self.model)
 
     @cached_property
-    def exchange(self) -> CommunicationGraph:
+    def comm_graph(self) -> CommunicationGraph:
         """The communication graph."""
-        return build_exchange(self.model, self.timings)
+        return build_comm_graph(self.model, self.timings)
 
     @property
     def subsystems(self) -> tuple[SubsystemJacobians, ...]:
@@ -118,19 +118,19 @@ class ModelNumbers:
 
     def vector(self, peer: int) -> Floats:
         """Return the parameters (n_p,) of a peer."""
-        group = self.exchange.group_of(peer)
-        row = self.numbers.rows[group][peer - self.exchange.starts[group]]
+        group = self.comm_graph.group_of(peer)
+        row = self.numbers.rows[group][peer - self.comm_graph.starts[group]]
         return np.asarray(self.numbers.parameters[group][row])
 
     @cached_property
     def weight_sums(self) -> dict[str, NDArray[Any]]:
         """The exact sum of the weights that each peer receives (N,), by the parameter of a link with arcs."""
         links = (link for link in self.model.links if link.graph.shape == "arcs")
-        return {count_of(link.name): received_sums(link, self.exchange.peers) for link in links}
+        return {count_of(link.name): received_sums(link, self.comm_graph.peers) for link in links}
 
     def exact_vector(self, peer: int) -> list[Fraction]:
         """Return the parameters (n_p,) of a peer exactly: its floats, and its sums of weights."""
-        group = self.model.groups[self.exchange.group_of(peer)]
+        group = self.model.groups[self.comm_graph.group_of(peer)]
         names = self.model.peer_types[group.peer_type].parameters
         return [
             self.weight_sums[name][peer] if name in self.weight_sums else number

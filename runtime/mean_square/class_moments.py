@@ -72,7 +72,7 @@ class PerTickReception:
     """The peers of a model with a separate reception at each tick: `rows` lists them by class."""
 
     groups: tuple[PeerClass, ...]
-    exchange: CommunicationGraph
+    comm_graph: CommunicationGraph
     rows: Mapping[int, tuple[UncertainSample, ...]]
     timings: Mapping[str, Fraction]
     frame: Fraction
@@ -118,11 +118,11 @@ def build_reception(
     shifted_system = replace(
         model, timings=tuple(replace(timing, value=timings[timing.name]) for timing in model.timings)
     )
-    groups, exchange = lifted_classes(replace(numeric, model=shifted_system, given_schedules=by_tick))
-    rows = {group.index: schedules[exchange.group_of(group.peers.first)].selected for group in groups}
+    groups, comm_graph = lifted_classes(replace(numeric, model=shifted_system, given_schedules=by_tick))
+    rows = {group.index: schedules[comm_graph.group_of(group.peers.first)].selected for group in groups}
     strictly = numeric.order.index("tick") < numeric.order.index("deliver")
     frame, quantum = schedules[0].frame_s, schedules[0].quantum
-    return PerTickReception(groups, exchange, rows, timings, frame, quantum, strictly)
+    return PerTickReception(groups, comm_graph, rows, timings, frame, quantum, strictly)
 
 
 def local_value(row: UncertainSample) -> SentSample:
@@ -473,17 +473,17 @@ def peer_classes(reception: PerTickReception) -> tuple[ModalSystem, Coupling]:
     Peers of a class are exchangeable: each receives from all peers of a class, its own included, with equal
     weight, or from none.
     """
-    groups, exchange = reception.groups, reception.exchange
-    if not incomplete_links((group.schedule for group in groups), exchange):
-        degrees = complete_degrees(groups, exchange)
+    groups, comm_graph = reception.groups, reception.comm_graph
+    if not incomplete_links((group.schedule for group in groups), comm_graph):
+        degrees = complete_degrees(groups, comm_graph)
 
         def weight(coupling_term: CouplingTerm, g: int, h: int) -> Fraction:
             """Return 1 if a class has a peer that a peer of class g receives from, else 0."""
             return Fraction(groups[h].count > (1 if g == h else 0))
 
-        return complete_loops(groups, exchange)[0], couple(groups, exchange, weight, degrees)
-    dense = dense_loop(groups, exchange)
-    common = split_exchangeable(dense, exchange)[0]
+        return complete_loops(groups, comm_graph)[0], couple(groups, comm_graph, weight, degrees)
+    dense = dense_loop(groups, comm_graph)
+    common = split_exchangeable(dense, comm_graph)[0]
     index = {group.peers.first: number for number, group in enumerate(dense.subsystems)}
     first = [index[subsystem.peers.first] for subsystem in common.subsystems]
     last = [index[subsystem.peers.last] for subsystem in common.subsystems]

@@ -67,7 +67,7 @@ class Forced:
 
     def peer_by_peer(self) -> list[tuple[int, PeerReadings]]:
         """Return the readings of each peer, in the order of peers."""
-        return self.of(dense_loop(self.reception.groups, self.reception.exchange).subsystems)
+        return self.of(dense_loop(self.reception.groups, self.reception.comm_graph).subsystems)
 
 
 def forced(model: Model, reception: PerTickReception, first: Fraction = Fraction(0)) -> Forced:

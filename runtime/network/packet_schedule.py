@@ -122,7 +122,7 @@ class ArrivalProcess:
 def arrival_process_of(
     model: Model,
     timings: Mapping[str, Fraction],
-    exchange: CommunicationGraph,
+    comm_graph: CommunicationGraph,
     route: Route,
     quantum: Fraction,
 ) -> ArrivalProcess:
@@ -134,7 +134,7 @@ def arrival_process_of(
         The model, with the parameter values to use (see `overrides.apply`).
     timings
         Seconds by the name of the timing.
-    exchange
+    comm_graph
         The communication graph.
     route
         The route.
@@ -147,16 +147,16 @@ def arrival_process_of(
         E891 a group sets its own value for a link parameter; E892 too many packets in transit, or times
         of too many quanta.
     """
-    link = exchange.links[route.link]
+    link = comm_graph.links[route.link]
     assert link.channel is not None
     grids = {
         clock.name: (timings[clock.phase] / quantum, timings[clock.period] / quantum)
         for clock in model.clocks
     }
     sending_clock = grids[route.sent_by or link.clock]
-    groups, group_pair_of = _group_pairs(exchange, route.pairs)
+    groups, group_pair_of = _group_pairs(comm_graph, route.pairs)
     least = int(link.after)
-    pair_delays = [exchange.delay(link.name, *pair) for pair in groups]
+    pair_delays = [comm_graph.delay(link.name, *pair) for pair in groups]
     delays = [*dict.fromkeys(pair_delays)]
     law_of = np.array([delays.index(delay) for delay in pair_delays], np.int64)[group_pair_of]
     arrival_process = ArrivalProcess(
@@ -393,13 +393,13 @@ def _link_receivers(
 
 
 def routes_of(
-    model: Model, timings: Mapping[str, Fraction], exchange: CommunicationGraph, frame_s: Fraction
+    model: Model, timings: Mapping[str, Fraction], comm_graph: CommunicationGraph, frame_s: Fraction
 ) -> tuple[Route, ...]:
     """Return the routes: one per unreliable link, per clock that receives from it, and per clock that sends.
 
     Parameters
     ----------
-    model, timings, exchange
+    model, timings, comm_graph
         As for `arrival_process_of`.
     frame_s
         The length of a frame in seconds.
@@ -410,27 +410,27 @@ def routes_of(
         E891 a group sets its own value for a link parameter; E892 too many directed peer pairs.
     """
     unreliable = [link for link in model.links if link.channel is not None]
-    result = [_routes_over(model, timings, exchange, frame_s, link) for link in unreliable]
+    result = [_routes_over(model, timings, comm_graph, frame_s, link) for link in unreliable]
     return tuple(route for routes in result for route in routes)
 
 
 def _routes_over(
     model: Model,
     timings: Mapping[str, Fraction],
-    exchange: CommunicationGraph,
+    comm_graph: CommunicationGraph,
     frame_s: Fraction,
     link: Link,
 ) -> list[Route]:
     """Return the routes of a link: its directed links, grouped by the clocks of receivers and of packets."""
-    peers = exchange.peers
+    peers = comm_graph.peers
     if link.graph.shape == "complete" and peers * (peers - 1) > MOST_ARCS:
         message = (
             f"{link.name} is unreliable; {peers} completely connected peers have "
             f"{peers * (peers - 1)} directed connections; the limit is {MOST_ARCS}"
         )
         raise ApcError(Diagnostic("E892", SourceLocation(model.origin.topology), message, fix="graph: ring"))
-    peer_type_of = np.repeat([group.peer_type for group in model.groups], np.diff(exchange.starts))
-    pairs, weights = exchange.arcs(link.name)
+    peer_type_of = np.repeat([group.peer_type for group in model.groups], np.diff(comm_graph.starts))
+    pairs, weights = comm_graph.arcs(link.name)
     order = np.lexsort((pairs[:, 0], pairs[:, 1]))  # receiver by receiver
     pairs, weights = pairs[order], weights[order]
     sends = np.array(
@@ -440,12 +440,12 @@ def _routes_over(
     for clock in model.clocks:
         receives = np.array([_receives(peer_type, link.name, clock.name) for peer_type in model.peer_types])
         arcs = sends[peer_type_of[pairs[:, 0]]] & receives[peer_type_of[pairs[:, 1]]]
-        sent_by = _own_clocks(exchange, link, pairs)
+        sent_by = _own_clocks(comm_graph, link, pairs)
         for name in sorted({*sent_by[arcs].tolist()}):
             of_clock = arcs & (sent_by == name)
             used[clock.name, name] = pairs[of_clock], weights[of_clock]
-    groups = {pair for clock_pairs, _ in used.values() for pair in _group_pairs(exchange, clock_pairs)[0]}
-    delays = {exchange.delay(link.name, *pair) for pair in groups}
+    groups = {pair for clock_pairs, _ in used.values() for pair in _group_pairs(comm_graph, clock_pairs)[0]}
+    delays = {comm_graph.delay(link.name, *pair) for pair in groups}
     longest = max((channel_law(model, link, delay).longest for delay in delays), default=0.0)
     periods = {clock.name: timings[clock.period] for clock in model.clocks}
     return [
@@ -466,10 +466,10 @@ def _routes_over(
     ]
 
 
-def _own_clocks(exchange: CommunicationGraph, link: Link, pairs: Integers) -> NDArray[np.str_]:
+def _own_clocks(comm_graph: CommunicationGraph, link: Link, pairs: Integers) -> NDArray[np.str_]:
     """Return the own clock (M,) of each directed link, empty for that of the link."""
-    groups, of_pair = _group_pairs(exchange, pairs)
-    clocks = [link.own_clock(exchange.delay(link.name, *pair)) for pair in groups]
+    groups, of_pair = _group_pairs(comm_graph, pairs)
+    clocks = [link.own_clock(comm_graph.delay(link.name, *pair)) for pair in groups]
     return np.array(clocks, np.str_)[of_pair]
 
 
@@ -479,10 +479,10 @@ def _receives(peer_type: PeerType, link: str, clock: str) -> bool:
     return any(receive.link == link for partition in partitions for receive in partition.receives)
 
 
-def _group_pairs(exchange: CommunicationGraph, pairs: Integers) -> tuple[list[tuple[int, int]], Integers]:
+def _group_pairs(comm_graph: CommunicationGraph, pairs: Integers) -> tuple[list[tuple[int, int]], Integers]:
     """Return the distinct (sender, receiver) pairs of groups, and the index (M,) of each pair of peers."""
-    groups = np.searchsorted(exchange.starts, pairs, side="right") - 1
-    count = len(exchange.groups)
+    groups = np.searchsorted(comm_graph.starts, pairs, side="right") - 1
+    count = len(comm_graph.groups)
     distinct, of_pair = np.unique(groups[:, 0] * count + groups[:, 1], return_inverse=True)
     return [divmod(item, count) for item in distinct.tolist()], of_pair
 

@@ -49,7 +49,7 @@ from apc.simulation.output_blocks import forces_in_time, unsolved
 from apc.simulation.population import instants_within
 from apc.simulation.settings import Settings
 from apc.simulation.simulation import prepare
-from apc.timing.communication_graph import CommunicationGraph, build_exchange
+from apc.timing.communication_graph import CommunicationGraph, build_comm_graph
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -144,9 +144,11 @@ class PeerLoop:
             `prepare` and `means_at_joins`.
         """
         self.model, self.name = model, peer
-        self.exchange = build_exchange(model, resolve(model).timings)
-        self.local = number_of(self.exchange, peer, "--peer")
-        self.others = {number_of(self.exchange, text, "--to"): address for text, address in addresses.items()}
+        self.comm_graph = build_comm_graph(model, resolve(model).timings)
+        self.local = number_of(self.comm_graph, peer, "--peer")
+        self.others = {
+            number_of(self.comm_graph, text, "--to"): address for text, address in addresses.items()
+        }
         settings = Settings(duration, jit=False, seed=seed)
         self.simulation = prepare(live_topology(model), settings, signals=[f"{peer}.*"], live=True)
         self.means = means_at_joins(model)
@@ -189,7 +191,7 @@ class PeerLoop:
         """Raise ApcError E971 for missing, superfluous or equal addresses."""
         pairs = {tuple(pair) for route in self.routes for pair in route.pairs.tolist()}
         needed = {item for pair in pairs if self.local in pair for item in pair} - {self.local}
-        unknown = [self.exchange.peer_name(other) for other in sorted(needed - set(self.others))][:4]
+        unknown = [self.comm_graph.peer_name(other) for other in sorted(needed - set(self.others))][:4]
         wrong = (
             (
                 not needed,
@@ -264,7 +266,7 @@ class PeerLoop:
     def _no_answer(self, patience: float) -> ApcError:
         """Return error E972 for peers that did not reply in time."""
         missing = sorted(set(self.others) - set(self.post.nonces)) or sorted(self.others)[:1]
-        names = ", ".join(self.exchange.peer_name(number) for number in missing)
+        names = ", ".join(self.comm_graph.peer_name(number) for number in missing)
         dropped = self.post.dropped.items()
         text = "; ".join(f"{counted(count, 'datagram')} dropped: {DROPPED[why]}" for why, count in dropped)
         message = f"no start time received from {names} within {patience:g} s" + (text and f" ({text})")
@@ -667,10 +669,10 @@ class _EmulatedNetwork:
 
         A link without a declared channel has its nominal delay and no losses.
         """
-        loop, exchange = self.loop, self.loop.exchange
+        loop, comm_graph = self.loop, self.loop.comm_graph
         arc, declared_link = (loop.local, receiver), loop.model.links[link.location]
-        sender_group, receiver_group = map(exchange.group_of, arc)
-        delay = exchange.delay(link.name, sender_group, receiver_group)
+        sender_group, receiver_group = map(comm_graph.group_of, arc)
+        delay = comm_graph.delay(link.name, sender_group, receiver_group)
         law = channel_law(
             loop.model,
             declared_link if declared_link.channel else traced(declared_link, [float(self.timings[delay])]),
@@ -685,12 +687,12 @@ def _packet_delays(source: PacketSource) -> Iterator[float]:
         yield from source.take(AHEAD)[0].tolist()
 
 
-def number_of(exchange: CommunicationGraph, name: str, option: str) -> int:
+def number_of(comm_graph: CommunicationGraph, name: str, option: str) -> int:
     """Return the number of a peer with a name such as `left[1]`, as given to an option.
 
     Parameters
     ----------
-    exchange
+    comm_graph
         The peers of the model.
     name, option
         The name of the peer, and the option for messages.
@@ -700,11 +702,11 @@ def number_of(exchange: CommunicationGraph, name: str, option: str) -> int:
     ApcError
         E970 there is no such peer.
     """
-    every = [exchange.peer_name(index) for index in range(exchange.peers)]
+    every = [comm_graph.peer_name(index) for index in range(comm_graph.peers)]
     if name in every:
         return every.index(name)
     names = every[:4]
     expected = f"one of {', '.join(names)}{', …' if len(every) > 4 else ''}"
-    near = nearest(name, [f"{group}[1]" for group in exchange.groups]) or names[0]
+    near = nearest(name, [f"{group}[1]" for group in comm_graph.groups]) or names[0]
     fix = f'{option} "{near}{"=HOST:PORT" if option == "--to" else ""}"'
     raise ApcError(Diagnostic("E970", SourceLocation(option), "peer", expected, cut(name) or "nothing", fix))

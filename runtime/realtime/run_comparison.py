@@ -32,7 +32,7 @@ from apc.simulation.output_blocks import blocks
 from apc.simulation.population import Population
 from apc.simulation.settings import Settings
 from apc.simulation.simulation import Simulation, prepare
-from apc.timing.communication_graph import build_exchange
+from apc.timing.communication_graph import build_comm_graph
 
 Floats = NDArray[np.float64]
 
@@ -250,14 +250,14 @@ def _arc_runs(run: RealtimeRun) -> tuple[ArcRun, ...]:
     model, peers = run.model, {peer.number: peer for peer in run.peers}
     timings = {timing.name: float(timing.value) for timing in model.timings}
     periods = {clock.name: timings[clock.period] for clock in model.clocks}
-    exchange = build_exchange(model, resolve(model).timings)
+    comm_graph = build_comm_graph(model, resolve(model).timings)
     arc_runs = []
     for peer in run.peers:
         for number, sender in peer.arcs:
             link, trace = model.links[number], trace_name(model, number, sender, peer.number)
             other = peers.get(sender)
             clock = link.clock_at(
-                exchange.delay(link.name, exchange.group_of(sender), exchange.group_of(peer.number))
+                comm_graph.delay(link.name, comm_graph.group_of(sender), comm_graph.group_of(peer.number))
             )
             came = fit_delays(delays_of(peer, number, sender), trace, interval=periods[clock])
             arc_runs.append(

@@ -29,7 +29,7 @@ from apc.realtime.peer import PeerLoop, StoppedError
 from apc.realtime.peer_run import PeerRun, run_of
 from apc.realtime.process_priority import claim
 from apc.support.processes import Workers, digest_of, local_processes, model_bytes, model_of_bytes
-from apc.timing.communication_graph import build_exchange
+from apc.timing.communication_graph import build_comm_graph
 
 MOST_PEERS = 64  # processes of one machine
 LOOPBACK = "127.0.0.1"
@@ -188,9 +188,9 @@ def run_all(compiled_model: Model, how: LocalRun) -> tuple[RunPart, ...]:
     ApcError
         E975 too many peers.
     """
-    exchange = build_exchange(compiled_model, resolve(compiled_model).timings)
-    if exchange.peers > MOST_PEERS:
-        message = f"{exchange.peers:,} peers need as many processes; the limit is {MOST_PEERS}"
+    comm_graph = build_comm_graph(compiled_model, resolve(compiled_model).timings)
+    if comm_graph.peers > MOST_PEERS:
+        message = f"{comm_graph.peers:,} peers need as many processes; the limit is {MOST_PEERS}"
         raise ApcError(
             Diagnostic(
                 "E975",
@@ -199,7 +199,7 @@ def run_all(compiled_model: Model, how: LocalRun) -> tuple[RunPart, ...]:
                 advice="start each peer with --peer NAME",
             )
         )
-    names = [exchange.peer_name(index) for index in range(exchange.peers)]
+    names = [comm_graph.peer_name(index) for index in range(comm_graph.peers)]
     sockets = {name: listen_at((LOOPBACK, 0)) for name in names}
     addresses = {name: listening.getsockname() for name, listening in sockets.items()}
     stop, end = multiprocessing.Pipe(duplex=False)

@@ -29,7 +29,7 @@ from apc.result import PlotStyle, Result
 from apc.studies.crossing import Progress
 from apc.support.extension_table import require_extension
 from apc.support.option_value import with_last_unit
-from apc.timing.communication_graph import build_exchange
+from apc.timing.communication_graph import build_comm_graph
 
 # The relative position of the second parameter value in a test of dependence: an uncommon ratio.
 MOVE = Fraction(19, 13)
@@ -204,7 +204,7 @@ def gain_factor(model: Model, axis: Range) -> int:
     numbers_before = resolve(model)
     value = axis.low + (axis.high - axis.low) * (MOVE - 1)
     numbers_after = resolve(apply(model, [Override(axis.free, value)]))
-    exchange = build_exchange(model, numbers_before.timings)
+    comm_graph = build_comm_graph(model, numbers_before.timings)
     factors: set[int] = set()
     subsystems = linear_subsystems(model, numbers_before.timings)
     for index, group in enumerate(model.groups):
@@ -223,10 +223,10 @@ def gain_factor(model: Model, axis: Range) -> int:
                 receive = partition.receives[column]
                 if receive.operator == "mean":
                     factors.add(1)
-                elif exchange.is_complete(receive.link):
+                elif comm_graph.is_complete(receive.link):
                     factors.add(model.peers - 1)
                 else:
-                    received = np.bincount(exchange.arcs(receive.link)[0][:, 1], minlength=model.peers)
+                    received = np.bincount(comm_graph.arcs(receive.link)[0][:, 1], minlength=model.peers)
                     factors |= set(received.tolist())
     if len(factors) > 1:
         message = (

@@ -142,13 +142,13 @@ class ExchangeProgram:
 
 
 def exchange_program_of(
-    exchange: CommunicationGraph, members: Sequence[GroupProgram], routes: Sequence[Route]
+    comm_graph: CommunicationGraph, members: Sequence[GroupProgram], routes: Sequence[Route]
 ) -> ExchangeProgram:
     """Return the exchange program of a frame.
 
     Parameters
     ----------
-    exchange
+    comm_graph
         The communication graph.
     members
         The members of each group, in the model's order.
@@ -160,7 +160,7 @@ def exchange_program_of(
     ApcError
         E801 a mean over no peers, E802 a mean whose weights add up to 0.
     """
-    return _ExchangeBuilder(exchange, members, routes).exchange_program()
+    return _ExchangeBuilder(comm_graph, members, routes).exchange_program()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -180,15 +180,15 @@ class _ExchangeBuilder:
     """Builds the operations of all segments; common arcs and functions are built once."""
 
     def __init__(
-        self, exchange: CommunicationGraph, members: Sequence[GroupProgram], routes: Sequence[Route]
+        self, comm_graph: CommunicationGraph, members: Sequence[GroupProgram], routes: Sequence[Route]
     ) -> None:
-        self.exchange, self.members, self.routes = exchange, members, tuple(routes)
+        self.comm_graph, self.members, self.routes = comm_graph, members, tuple(routes)
         self.route_of = {
             (route.link, route.clock, route.sent_by): index for index, route in enumerate(routes)
         }
         self.first = np.cumsum([0, *(member.count for member in members)])
-        self.member_of = np.empty(exchange.peers, np.int64)  # of each peer of the model
-        self.index_in = np.empty(exchange.peers, np.int64)  # among that member's peers
+        self.member_of = np.empty(comm_graph.peers, np.int64)  # of each peer of the model
+        self.index_in = np.empty(comm_graph.peers, np.int64)  # among that member's peers
         for number, member in enumerate(members):
             self.member_of[member.peers] = number
             self.index_in[member.peers] = np.arange(member.count)
@@ -203,14 +203,14 @@ class _ExchangeBuilder:
         ]
         self.sending = {
             link: np.array([any(send.link == link for send in m.program.peer_type.sends) for m in members])
-            for link in exchange.links
+            for link in comm_graph.links
         }
         self.functions: dict[Any, int] = {}  # casadi.Function
         self.arcs: dict[tuple[int, CouplingTerm, str], _Arcs] = {}
 
     def exchange_program(self) -> ExchangeProgram:
         """Return the exchange program with the values at time 0."""
-        start = np.zeros((len(self.keys), self.exchange.peers))
+        start = np.zeros((len(self.keys), self.comm_graph.peers))
         for g, member in enumerate(self.members):
             for key, sent in enumerate(self.keys):
                 start[key, self.first[g] : self.first[g + 1]] = _first_packet(member, sent.link, sent.channel)
@@ -295,10 +295,10 @@ class _ExchangeBuilder:
     ) -> Operation:
         """Return the operation of a received row that is a plain sum or mean."""
         coupling_term, source = row.coupling_term, self._source(row)
-        if isinstance(source, Arrived) or not self.exchange.is_complete(coupling_term.link):
+        if isinstance(source, Arrived) or not self.comm_graph.is_complete(coupling_term.link):
             arcs = self._arcs(member_index, row)
             width = (
-                len(self.routes[source.route].pairs) if isinstance(source, Arrived) else self.exchange.peers
+                len(self.routes[source.route].pairs) if isinstance(source, Arrived) else self.comm_graph.peers
             )
             shape = (self.members[member_index].count, width)
             weights = csr_array((arcs.weights, (arcs.receivers, arcs.senders)), shape=shape)
@@ -307,7 +307,7 @@ class _ExchangeBuilder:
         senders = [
             member
             for member in np.flatnonzero(sending).tolist()
-            if self.exchange.delay(coupling_term.link, self.members[member].group, group)
+            if self.comm_graph.delay(coupling_term.link, self.members[member].group, group)
             == coupling_term.delay
         ]
         divisor = 1.0
@@ -381,7 +381,7 @@ class _ExchangeBuilder:
                 totals = self._checked_weight_sums(member_index, coupling_term, *of_all)
                 weights = weights / totals[receivers] if coupling_term.operator == "mean" else weights
             group = self.members[member_index].group
-            delays = [self.exchange.delay(link, member.group, group) for member in self.members]
+            delays = [self.comm_graph.delay(link, member.group, group) for member in self.members]
             of_delay = np.array([delay == coupling_term.delay for delay in delays])[members]
             self.arcs[key] = _Arcs(senders[of_delay], receivers[of_delay], weights[of_delay])
         return self.arcs[key]
@@ -398,15 +398,15 @@ class _ExchangeBuilder:
             arcs = np.flatnonzero(self.member_of[route.pairs[:, 1]] == member_index)
             pairs = route.pairs[arcs]
             return arcs, self.index_in[pairs[:, 1]], route.weights[arcs], self.member_of[pairs[:, 0]]
-        if self.exchange.is_complete(link):
+        if self.comm_graph.is_complete(link):
             peers = np.stack(
-                np.meshgrid(np.arange(self.exchange.peers), self.members[member_index].peers), axis=-1
+                np.meshgrid(np.arange(self.comm_graph.peers), self.members[member_index].peers), axis=-1
             )
             pairs = peers.reshape(-1, 2)
             pairs = pairs[pairs[:, 0] != pairs[:, 1]]
             weights = np.ones(len(pairs))
         else:
-            pairs, weights = self.exchange.arcs(link)
+            pairs, weights = self.comm_graph.arcs(link)
         used = self.sending[link][self.member_of[pairs[:, 0]]] & (self.member_of[pairs[:, 1]] == member_index)
         pairs = pairs[used]
         return (
@@ -430,7 +430,7 @@ class _ExchangeBuilder:
         for index in np.flatnonzero(~is_valid).tolist():
             peer = int(member.peers[index])
             check_mean(
-                self.exchange,
+                self.comm_graph,
                 peer,
                 coupling_term.link,
                 coupling_term.operator,

@@ -90,7 +90,7 @@ def _rows(symbols: Any, indices: Sequence[int]) -> Any:
     return casadi.vertcat(*(symbols[index] for index in indices)) if indices else casadi.SX(0, 1)
 
 
-def count_pairs(model: Model, exchange: CommunicationGraph) -> int:
+def count_pairs(model: Model, comm_graph: CommunicationGraph) -> int:
     """Return the number of pairwise evaluations at one tick, summed over all links."""
     links = {
         receive.link
@@ -99,5 +99,7 @@ def count_pairs(model: Model, exchange: CommunicationGraph) -> int:
         for receive in partition.receives
         if edge_name(partition, receive)
     }
-    n = exchange.peers
-    return sum(n * (n - 1) if exchange.is_complete(link) else len(exchange.arcs(link)[0]) for link in links)
+    n = comm_graph.peers
+    return sum(
+        n * (n - 1) if comm_graph.is_complete(link) else len(comm_graph.arcs(link)[0]) for link in links
+    )

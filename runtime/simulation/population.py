@@ -199,13 +199,13 @@ def refuse_unheard_of(model: Model) -> None:
 
 
 def build_population(
-    exchange: CommunicationGraph, members: Sequence[GroupProgram], routes: Sequence[Route] = ()
+    comm_graph: CommunicationGraph, members: Sequence[GroupProgram], routes: Sequence[Route] = ()
 ) -> Population:
     """Return the population of all members, with their programs joined by the packets between them.
 
     Parameters
     ----------
-    exchange
+    comm_graph
         The communication graph.
     members
         The members of each group, in the model's order.
@@ -222,7 +222,7 @@ def build_population(
     parts = (part for member in members for part in member.program.layout.parts)
     return Population(
         members=tuple(members),
-        exchange_program=exchange_program_of(exchange, members, routes),
+        exchange_program=exchange_program_of(comm_graph, members, routes),
         quantum=schedule.quantum,
         frame=schedule.frame,
         sample_count=len(schedule.sample_times) - 1,

@@ -59,7 +59,7 @@ from apc.simulation.signals import (
 )
 from apc.support.extension_table import require_extension
 from apc.support.memory import refuse_beyond
-from apc.timing.communication_graph import CommunicationGraph, build_exchange
+from apc.timing.communication_graph import CommunicationGraph, build_comm_graph
 from apc.timing.schedule import Propagate, Schedule
 from apc.timing.scheduling import build_schedules
 
@@ -184,7 +184,7 @@ def prepare(
         model = plan.model
         choices = _choices(plan, signals)
         members = _members(plan, choices, settings.method, live=live)
-        population = build_population(plan.exchange, members, plan.routes)
+        population = build_population(plan.comm_graph, members, plan.routes)
     schedule, recorded = plan.schedules[0], signals_of(model, choices)
     presence: Presence | None = None
     if model.experiment.joins or model.experiment.leaves:
@@ -201,7 +201,7 @@ def prepare(
         order=_order(model, population, recorded),
         forces=tuple(_forces(member) for member in members),
         arrival_processes=tuple(
-            arrival_process_of(model, timings, plan.exchange, route, quantum) for route in plan.routes
+            arrival_process_of(model, timings, plan.comm_graph, route, quantum) for route in plan.routes
         ),
         seed=model.experiment.seed if settings.seed is None else settings.seed,
         tolerances=_tolerances(model, plan.flows),
@@ -288,7 +288,7 @@ class SimulationPlan:
 
     model: Model
     numbers: ResolvedNumbers
-    exchange: CommunicationGraph
+    comm_graph: CommunicationGraph
     subsystems: tuple[SubsystemJacobians, ...]
     flows: tuple[Flow | None, ...]
     routes: tuple[Route, ...]
@@ -306,18 +306,18 @@ def plan_of(model: Model, method: Method) -> SimulationPlan:
     flows = tuple(
         _flow(model, numbers, index, subsystem, method) for index, subsystem in enumerate(subsystems)
     )
-    exchange = build_exchange(model, numbers.timings)
+    comm_graph = build_comm_graph(model, numbers.timings)
     patterns = [subsystem.pattern for subsystem in subsystems]
     schedules = build_schedules(model, numbers.timings, patterns)
-    routes = routes_of(model, numbers.timings, exchange, schedules[0].frame_s)
+    routes = routes_of(model, numbers.timings, comm_graph, schedules[0].frame_s)
     if routes:
         stored = {route.link: route.frames for route in routes}
         schedules = build_schedules(model, numbers.timings, patterns, stored=stored)
     if not model.clocks:  # then there is one interval, of any length
         schedules = tuple(replace(schedule, quantum=ROW / schedule.frame) for schedule in schedules)
-    _check_size(model, exchange, schedules)
+    _check_size(model, comm_graph, schedules)
     _check_step(model, numbers, schedules, method)
-    return SimulationPlan(model, numbers, exchange, subsystems, flows, routes, schedules)
+    return SimulationPlan(model, numbers, comm_graph, subsystems, flows, routes, schedules)
 
 
 def _choices(plan: SimulationPlan, signals: Sequence[str]) -> tuple[SignalSelection, ...]:
@@ -328,7 +328,7 @@ def _choices(plan: SimulationPlan, signals: Sequence[str]) -> tuple[SignalSelect
         for group, schedule in zip(model.groups, plan.schedules, strict=True)
     ]
     choices = choose(model, available, signals)
-    _check_size(model, plan.exchange, plan.schedules, choices)
+    _check_size(model, plan.comm_graph, plan.schedules, choices)
     return choices
 
 
@@ -368,7 +368,7 @@ def _members(
                 )
                 transitions = perturbed(transitions, 0) if method.perturbed else transitions
             peer_numbers, subsystem = (
-                plan.exchange.starts[group] + peers,
+                plan.comm_graph.starts[group] + peers,
                 plan.subsystems[model_group.peer_type],
             )
             members.append(
@@ -421,7 +421,7 @@ def _ticks_at_zero(model: Model, numbers: ResolvedNumbers) -> bool:
 
 def _check_size(
     model: Model,
-    exchange: CommunicationGraph,
+    comm_graph: CommunicationGraph,
     schedules: Sequence[Schedule],
     choices: Sequence[SignalSelection] = (),
 ) -> None:
@@ -437,7 +437,7 @@ def _check_size(
             len(peer_type.states) + len(peer_type.holds) + 1
         )
         total += group.count * (numbers_per_peer + sum(schedule.depths))
-    total += NUMBERS_A_PAIR * count_pairs(model, exchange)
+    total += NUMBERS_A_PAIR * count_pairs(model, comm_graph)
     message = f"{model.peers:,} peers with {total:,} numbers in a frame"
     refuse_beyond(
         NUMBER * total,

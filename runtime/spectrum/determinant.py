@@ -54,7 +54,7 @@ class TransferMember:
 
 
 def _weights(
-    population: HeterogeneousGroup, populations: Sequence[HeterogeneousGroup], exchange: CommunicationGraph
+    population: HeterogeneousGroup, populations: Sequence[HeterogeneousGroup], comm_graph: CommunicationGraph
 ) -> tuple[Floats, Floats]:
     """Return the weight of another peer's packet for each entry of r on a complete graph, and the number of
     senders.
@@ -70,14 +70,14 @@ def _weights(
         senders[input_row] = sum(sender.counts.sum() for sender in populations if sender.sends(link))
         senders[input_row] -= population.sends(link)
         if received.coupling_term.operator == "mean":
-            first, others = int(exchange.starts[population.group]), float(senders[input_row])
-            check_mean(exchange, first, link, "mean", others > 0, Fraction(others))
+            first, others = int(comm_graph.starts[population.group]), float(senders[input_row])
+            check_mean(comm_graph, first, link, "mean", others > 0, Fraction(others))
             weights[input_row] = 1.0 / others
     return weights, senders
 
 
 def population_characteristic(
-    populations: Sequence[HeterogeneousGroup], exchange: CommunicationGraph
+    populations: Sequence[HeterogeneousGroup], comm_graph: CommunicationGraph
 ) -> tuple[Characteristic, tuple[TransferMember, ...]]:
     """Return the characteristic function of different peers on complete graphs.
 
@@ -85,10 +85,10 @@ def population_characteristic(
     ----------
     populations
         All peers.
-    exchange
+    comm_graph
         The links, all of them complete.
     """
-    delay_classes = [exchange.delay_class(population.group) for population in populations]
+    delay_classes = [comm_graph.delay_class(population.group) for population in populations]
     sent_index: dict[tuple[int, SentSample], int] = {}
     received_index: dict[tuple[int, ReceivedSample], int] = {}
     group_of: dict[int, int] = {}
@@ -101,12 +101,14 @@ def population_characteristic(
 
     def has_delay(coupling_term: CouplingTerm, sender: int, receiver: int) -> bool:
         """Return whether a coupling term has the delay of a pair of delay classes."""
-        return exchange.delay(coupling_term.link, group_of[sender], group_of[receiver]) == coupling_term.delay
+        return (
+            comm_graph.delay(coupling_term.link, group_of[sender], group_of[receiver]) == coupling_term.delay
+        )
 
     members, subsystems = [], []
     for delay_class, population in zip(delay_classes, populations, strict=True):
         schedule = population.schedule
-        weight, senders = _weights(population, populations, exchange)
+        weight, senders = _weights(population, populations, comm_graph)
         rows = np.array([sent_index[delay_class, sent] for sent in schedule.sent], np.int64)
         input_rows = np.array(
             [received_index[delay_class, received] for received in schedule.received], np.int64

@@ -98,7 +98,7 @@ def radius_in_floats(loops: Sequence[ModalSystem]) -> float:
 
 
 def solve_populations(
-    populations: Sequence[HeterogeneousGroup], exchange: CommunicationGraph, *, rigid: int
+    populations: Sequence[HeterogeneousGroup], comm_graph: CommunicationGraph, *, rigid: int
 ) -> Spectrum:
     """Return the spectrum of different peers on complete graphs.
 
@@ -106,12 +106,12 @@ def solve_populations(
     ----------
     populations
         All peers.
-    exchange
+    comm_graph
         The links, all of them complete.
     rigid
         The number of common translations, from the equations (see `translation`).
     """
-    function, members = population_characteristic(populations, exchange)
+    function, members = population_characteristic(populations, comm_graph)
     peers = int(sum(len(population.parameters) for population in populations))
     zeros = find_zeros(
         function,

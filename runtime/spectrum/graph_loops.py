@@ -25,13 +25,13 @@ from apc.timing.communication_graph import CommunicationGraph, check_mean
 from apc.timing.schedule import CouplingTerm
 
 
-def common_graph(coupling_terms: Sequence[CouplingTerm], exchange: CommunicationGraph) -> str:
+def common_graph(coupling_terms: Sequence[CouplingTerm], comm_graph: CommunicationGraph) -> str:
     """Return the reason why the weight matrices of the links have different eigenvectors, "" if they are
     common.
     """
     links = list(dict.fromkeys(coupling_term.link for coupling_term in coupling_terms))
-    shapes = {exchange.links[link].graph.shape for link in links}
-    graphs = [exchange.links[link].graph for link in links]
+    shapes = {comm_graph.links[link].graph.shape for link in links}
+    graphs = [comm_graph.links[link].graph for link in links]
     if len(shapes) > 1 or any(
         not np.array_equal(graph.arcs, graphs[0].arcs) or not np.array_equal(graph.weights, graphs[0].weights)
         for graph in graphs
@@ -39,7 +39,7 @@ def common_graph(coupling_terms: Sequence[CouplingTerm], exchange: Communication
         return f"the graphs of {' and '.join(links)} are not the same"
     if (
         len({coupling_term.operator == "mean" for coupling_term in coupling_terms}) > 1
-        and _degree(links[0], exchange) is None
+        and _degree(links[0], comm_graph) is None
     ):
         return f"means and sums over {links[0]}, with unequal weights"
     if any(coupling_term.operator in ("max", "min") for coupling_term in coupling_terms):
@@ -47,10 +47,10 @@ def common_graph(coupling_terms: Sequence[CouplingTerm], exchange: Communication
     return ""
 
 
-def _degree(link: str, exchange: CommunicationGraph) -> Fraction | None:
+def _degree(link: str, comm_graph: CommunicationGraph) -> Fraction | None:
     """Return the total weight that every peer receives over a link, None if it differs between peers."""
-    pairs, weights = exchange.arcs(link)
-    sums = sum_weights(pairs[:, 1], weights, exchange.peers)
+    pairs, weights = comm_graph.arcs(link)
+    sums = sum_weights(pairs[:, 1], weights, comm_graph.peers)
     return sums[0] if np.all(sums == sums[0]) else None
 
 
@@ -63,7 +63,7 @@ class GraphScale:
 
 
 def graph_scale(
-    group: PeerClass, coupling_terms: Sequence[CouplingTerm], exchange: CommunicationGraph
+    group: PeerClass, coupling_terms: Sequence[CouplingTerm], comm_graph: CommunicationGraph
 ) -> GraphScale:
     """Return the weights of equal peers for their neighbours on the graph common to all coupling terms.
 
@@ -74,13 +74,13 @@ def graph_scale(
     """
     link = coupling_terms[0].link
     means = any(coupling_term.operator == "mean" for coupling_term in coupling_terms)
-    pairs, weights = exchange.arcs(link)
+    pairs, weights = comm_graph.arcs(link)
     if means:
-        sums = sum_weights(pairs[:, 1], weights, exchange.peers)
-        receives = np.bincount(pairs[:, 1], minlength=exchange.peers) > 0
+        sums = sum_weights(pairs[:, 1], weights, comm_graph.peers)
+        receives = np.bincount(pairs[:, 1], minlength=comm_graph.peers) > 0
         for peer in np.flatnonzero((sums == 0) | ~receives).tolist():
-            check_mean(exchange, peer, link, "mean", bool(receives[peer]), sums[peer])
-    degree = _degree(link, exchange)
+            check_mean(comm_graph, peer, link, "mean", bool(receives[peer]), sums[peer])
+    degree = _degree(link, comm_graph)
     return GraphScale(
         {
             coupling_term: group.gain(coupling_term, group)

@@ -60,14 +60,14 @@ class ModalDecomposition:
     notes: tuple[str, ...]
 
 
-def split(groups: Sequence[PeerClass], exchange: CommunicationGraph) -> tuple[ClosedLoop, ...]:
+def split(groups: Sequence[PeerClass], comm_graph: CommunicationGraph) -> tuple[ClosedLoop, ...]:
     """Return the complete system as the smallest closed loops that its graphs and groups allow.
 
     Parameters
     ----------
     groups
         All peers (see `peer_classes.classes_of_peers`).
-    exchange
+    comm_graph
         The links.
 
     Raises
@@ -75,37 +75,37 @@ def split(groups: Sequence[PeerClass], exchange: CommunicationGraph) -> tuple[Cl
     ApcError
         E801, E802 an undefined mean; E804 one system of too many states.
     """
-    loops = decompose(groups, exchange).loops
+    loops = decompose(groups, comm_graph).loops
     for modal_system in loops:
         if modal_system.states > MATRIX_STATES:
-            raise too_large(exchange, f"{exchange.peers:,} peers", modal_system.states)
+            raise too_large(comm_graph, f"{comm_graph.peers:,} peers", modal_system.states)
     return tuple(close_loop(modal_system) for modal_system in loops)
 
 
-def decompose(groups: Sequence[PeerClass], exchange: CommunicationGraph) -> ModalDecomposition:
+def decompose(groups: Sequence[PeerClass], comm_graph: CommunicationGraph) -> ModalDecomposition:
     """Return the independent loops of a complete system, before their matrices are built (see `split`).
 
     Parameters
     ----------
-    groups, exchange
+    groups, comm_graph
         As for `split`.
     """
     coupling_terms = used_coupling_terms(group.schedule for group in groups)
-    graphs = incomplete_links((group.schedule for group in groups), exchange)
+    graphs = incomplete_links((group.schedule for group in groups), comm_graph)
     if not graphs:
-        return ModalDecomposition("modes", complete_loops(groups, exchange), ())
-    named = " and ".join(f"{link} ({exchange.links[link].graph.shape})" for link in graphs)
-    reason = f"the peers on {named} differ" if len(groups) > 1 else common_graph(coupling_terms, exchange)
+        return ModalDecomposition("modes", complete_loops(groups, comm_graph), ())
+    named = " and ".join(f"{link} ({comm_graph.links[link].graph.shape})" for link in graphs)
+    reason = f"the peers on {named} differ" if len(groups) > 1 else common_graph(coupling_terms, comm_graph)
     if not reason:
-        scale = graph_scale(groups[0], coupling_terms, exchange)
-        modes = graph_modes(exchange.links[graphs[0]].graph, exchange.peers, mean=scale.by_mean)
+        scale = graph_scale(groups[0], coupling_terms, comm_graph)
+        modes = graph_modes(comm_graph.links[graphs[0]].graph, comm_graph.peers, mean=scale.by_mean)
         if modes is not None:
             note = f"{len(modes)} subsystems, one for each eigenvalue of the graph of {named}"
             return ModalDecomposition(
                 "modes", tuple(graph_loop(groups[0], graph_mode, scale) for graph_mode in modes), (note,)
             )
         reason = f"the graph of {named} has no full set of eigenvectors"
-    parts = split_exchangeable(dense_loop(groups, exchange), exchange)
+    parts = split_exchangeable(dense_loop(groups, comm_graph), comm_graph)
     if len(parts) > 1:
         note = f"{len(parts)} subsystems (common and difference motions of interchangeable peers)"
         return ModalDecomposition("modes", parts, (note,))
@@ -114,7 +114,7 @@ def decompose(groups: Sequence[PeerClass], exchange: CommunicationGraph) -> Moda
 
 def accepted_loops(
     groups: Sequence[PeerClass],
-    exchange: CommunicationGraph,
+    comm_graph: CommunicationGraph,
     accepted: Callable[[tuple[ModalSystem, ...]], bool],
     subject: str,
 ) -> tuple[tuple[ModalSystem, ...], bool]:
@@ -122,7 +122,7 @@ def accepted_loops(
 
     Parameters
     ----------
-    groups, exchange
+    groups, comm_graph
         As for `split`.
     accepted
         Whether a question can be answered from these loops.
@@ -134,25 +134,25 @@ def accepted_loops(
     ApcError
         E933 one loop of too many states.
     """
-    decomposed = decompose(groups, exchange)
+    decomposed = decompose(groups, comm_graph)
     if decomposed.method == "modes" and accepted(decomposed.loops):
         return decomposed.loops, True
     states = sum(group.count * states_of(group.schedule, group.jacobians) for group in groups)
     if states > MATRIX_STATES:
-        message = f"{subject}: {exchange.peers:,} peers on this graph form one system of {states:,} states"
+        message = f"{subject}: {comm_graph.peers:,} peers on this graph form one system of {states:,} states"
         advice = f"use equal peers on complete graphs, or at most {MATRIX_STATES:,} states in total"
-        raise ApcError(Diagnostic("E933", SourceLocation(exchange.topology), message, advice=advice))
-    return (dense_loop(groups, exchange),), False
+        raise ApcError(Diagnostic("E933", SourceLocation(comm_graph.topology), message, advice=advice))
+    return (dense_loop(groups, comm_graph),), False
 
 
 def orthogonal_loops(
-    groups: Sequence[PeerClass], exchange: CommunicationGraph, most: int
+    groups: Sequence[PeerClass], comm_graph: CommunicationGraph, most: int
 ) -> tuple[ModalSystem, ...]:
     """Return a model as orthogonal loops, the common loop first.
 
     Parameters
     ----------
-    groups, exchange
+    groups, comm_graph
         As for `split`.
     most
         The limit of peers on a graph that is not complete.
@@ -162,40 +162,42 @@ def orthogonal_loops(
     NotSupportedError
         More peers on such a graph than the limit.
     """
-    graphs = incomplete_links((group.schedule for group in groups), exchange)
+    graphs = incomplete_links((group.schedule for group in groups), comm_graph)
     if not graphs:
-        return complete_loops(groups, exchange)
+        return complete_loops(groups, comm_graph)
     count = sum(group.count for group in groups)
     if count > most:
         raise NotSupportedError(f"{count:,} peers on a graph that is not complete; the limit is {most}")
-    if len(groups) == 1 and all(exchange.links[link].graph.shape == "ring" for link in graphs):
-        arrangement = decompose(groups, exchange)
+    if len(groups) == 1 and all(comm_graph.links[link].graph.shape == "ring" for link in graphs):
+        arrangement = decompose(groups, comm_graph)
         if arrangement.method == "modes":
             return arrangement.loops
-    return split_exchangeable(dense_loop(groups, exchange), exchange)
+    return split_exchangeable(dense_loop(groups, comm_graph), comm_graph)
 
 
-def complete_loops(groups: Sequence[PeerClass], exchange: CommunicationGraph) -> tuple[ModalSystem, ...]:
+def complete_loops(groups: Sequence[PeerClass], comm_graph: CommunicationGraph) -> tuple[ModalSystem, ...]:
     """Return a common loop, and a difference loop for each group of two or more peers, on complete graphs.
 
     Parameters
     ----------
     groups
         All peers (see `peer_classes.classes_of_peers`).
-    exchange
+    comm_graph
         The links, all of them complete.
     """
-    degrees = complete_degrees(groups, exchange)
+    degrees = complete_degrees(groups, comm_graph)
     weights = couple(
         groups,
-        exchange,
+        comm_graph,
         lambda coupling_term, g, h: Fraction(groups[h].count - (1 if g == h else 0)),
         degrees,
     )
     loops = [ModalSystem(_mode_family(groups), 1, tuple(groups), weights)]
     if all(group.count < 2 for group in groups):
         return tuple(loops)
-    separation = couple(groups, exchange, lambda coupling_term, g, h: Fraction(-1 if g == h else 0), degrees)
+    separation = couple(
+        groups, comm_graph, lambda coupling_term, g, h: Fraction(-1 if g == h else 0), degrees
+    )
     for index, group in enumerate(groups):
         if group.count < 2:
             continue
@@ -205,14 +207,14 @@ def complete_loops(groups: Sequence[PeerClass], exchange: CommunicationGraph) ->
     return tuple(loops)
 
 
-def dense(groups: Sequence[PeerClass], exchange: CommunicationGraph) -> ClosedLoop:
+def dense(groups: Sequence[PeerClass], comm_graph: CommunicationGraph) -> ClosedLoop:
     """Return the closed loop of all peers of the system, as a reference; its cost is N³.
 
     Parameters
     ----------
     groups
         All peers (see `peer_classes.classes_of_peers`).
-    exchange
+    comm_graph
         The links.
 
     Raises
@@ -220,21 +222,21 @@ def dense(groups: Sequence[PeerClass], exchange: CommunicationGraph) -> ClosedLo
     ApcError
         E801, E802 an undefined mean; E804 more than `MATRIX_STATES` states.
     """
-    refuse_dense(groups, exchange)
-    return close_loop(dense_loop(groups, exchange))
+    refuse_dense(groups, comm_graph)
+    return close_loop(dense_loop(groups, comm_graph))
 
 
-def refuse_dense(groups: Sequence[PeerClass], exchange: CommunicationGraph) -> None:
+def refuse_dense(groups: Sequence[PeerClass], comm_graph: CommunicationGraph) -> None:
     """Raise ApcError E804 for a dense system with too many states, before any peer is evaluated."""
     states = sum(group.count * states_of(group.schedule, group.jacobians) for group in groups)
     if states > MATRIX_STATES:
-        raise too_large(exchange, f"{exchange.peers:,} peers", states)
+        raise too_large(comm_graph, f"{comm_graph.peers:,} peers", states)
 
 
-def dense_loop(groups: Sequence[PeerClass], exchange: CommunicationGraph) -> ModalSystem:
+def dense_loop(groups: Sequence[PeerClass], comm_graph: CommunicationGraph) -> ModalSystem:
     """Return all peers of the system as one loop, one subsystem per peer."""
     all_peers = tuple(
-        replace(group, name=exchange.peer_name(peer), count=1, peers=PeerIndices((range(peer, peer + 1),)))
+        replace(group, name=comm_graph.peer_name(peer), count=1, peers=PeerIndices((range(peer, peer + 1),)))
         for peer, group in sorted(
             ((peer, group) for group in groups for peer in group.peers), key=lambda pair: pair[0]
         )
@@ -242,9 +244,11 @@ def dense_loop(groups: Sequence[PeerClass], exchange: CommunicationGraph) -> Mod
     weights = {
         link: {
             (receiver, sender): exact_weight(weight)
-            for (sender, receiver), weight in zip(*(arc.tolist() for arc in exchange.arcs(link)), strict=True)
+            for (sender, receiver), weight in zip(
+                *(arc.tolist() for arc in comm_graph.arcs(link)), strict=True
+            )
         }
-        for link in exchange.links
+        for link in comm_graph.links
     }
     degrees: dict[tuple[str, int], Fraction] = {}
     for link, entries in weights.items():
@@ -253,7 +257,7 @@ def dense_loop(groups: Sequence[PeerClass], exchange: CommunicationGraph) -> Mod
                 degrees[link, receiver] = degrees.get((link, receiver), Fraction(0)) + weight
     coupling = couple(
         all_peers,
-        exchange,
+        comm_graph,
         lambda coupling_term, g, h: weights[coupling_term.link].get((g, h), Fraction(0)),
         degrees,
     )
@@ -267,7 +271,7 @@ def _mode_family(subsystems: Sequence[PeerClass]) -> str:
     return COUPLED if len(subsystems) > 1 else "common" if subsystems[0].count > 1 else "single"
 
 
-def split_exchangeable(modal_system: ModalSystem, exchange: CommunicationGraph) -> tuple[ModalSystem, ...]:
+def split_exchangeable(modal_system: ModalSystem, comm_graph: CommunicationGraph) -> tuple[ModalSystem, ...]:
     """Return a loop split by its interchangeable peers.
 
     Parameters
@@ -275,7 +279,7 @@ def split_exchangeable(modal_system: ModalSystem, exchange: CommunicationGraph) 
     modal_system
         A loop of all peers, one per subsystem, with exact weights; without interchangeable peers it is
         returned unchanged.
-    exchange
+    comm_graph
         The links, for the names of the groups.
     """
     classes: list[list[int]] = []
@@ -291,7 +295,8 @@ def split_exchangeable(modal_system: ModalSystem, exchange: CommunicationGraph) 
     if modal_system.weight_errors or len(classes) == len(modal_system.subsystems):
         return (modal_system,)
     subsystems = tuple(
-        _merged_class([modal_system.subsystems[index] for index in members], exchange) for members in classes
+        _merged_class([modal_system.subsystems[index] for index in members], comm_graph)
+        for members in classes
     )
     coupling = {
         coupling_term: tuple(
@@ -339,15 +344,15 @@ def _class_weight(
     return sum((row[index] for index in senders), Fraction(0))
 
 
-def _merged_class(subsystems: Sequence[PeerClass], exchange: CommunicationGraph) -> PeerClass:
+def _merged_class(subsystems: Sequence[PeerClass], comm_graph: CommunicationGraph) -> PeerClass:
     """Return equal subsystems as one class of peers."""
     peers = PeerIndices(tuple(run for subsystem in subsystems for run in subsystem.peers.runs))
-    return replace(subsystems[0], name=group_name(peers, exchange), count=len(peers), peers=peers)
+    return replace(subsystems[0], name=group_name(peers, comm_graph), count=len(peers), peers=peers)
 
 
 def couple(
     groups: Sequence[PeerClass],
-    exchange: CommunicationGraph,
+    comm_graph: CommunicationGraph,
     weigh: Callable[[CouplingTerm, int, int], Fraction],
     degrees: Mapping[tuple[str, int], Fraction],
 ) -> Coupling:
@@ -357,7 +362,7 @@ def couple(
     ----------
     groups
         The subsystems.
-    exchange
+    comm_graph
         The links.
     weigh
         Returns the weight of a packet of subsystem h at subsystem g in a plain sum.
@@ -372,7 +377,7 @@ def couple(
             if receives and coupling_term.operator == "mean":
                 total = degrees.get((coupling_term.link, g))
                 check_mean(
-                    exchange,
+                    comm_graph,
                     group.peers.first,
                     coupling_term.link,
                     "mean",
@@ -388,7 +393,7 @@ def couple(
                 )
                 if (
                     weight
-                    and exchange.delay(coupling_term.link, sender.delay_class, group.delay_class)
+                    and comm_graph.delay(coupling_term.link, sender.delay_class, group.delay_class)
                     == coupling_term.delay
                 ):
                     if coupling_term.operator == "mean":
@@ -404,11 +409,11 @@ def couple(
 
 
 def complete_degrees(
-    groups: Sequence[PeerClass], exchange: CommunicationGraph
+    groups: Sequence[PeerClass], comm_graph: CommunicationGraph
 ) -> dict[tuple[str, int], Fraction]:
     """Return the number of other peers from which a peer of each group receives, for each complete link."""
     degrees = {}
-    for link in exchange.links:
+    for link in comm_graph.links:
         total = sum(group.count for group in groups if group.sends(link))
         for g, group in enumerate(groups):
             number = total - (1 if group.sends(link) else 0)

@@ -156,8 +156,8 @@ def build_class(
     lifted
         Whether the class is lifted.
     """
-    exchange = numeric.exchange
-    group, vector = exchange.group_of(peers.first), numeric.vector(peers.first)
+    comm_graph = numeric.comm_graph
+    group, vector = comm_graph.group_of(peers.first), numeric.vector(peers.first)
     jacobians, schedule = numeric.subsystems[group], numeric.schedules[group]
     check_packets(schedule)
     exact_vector, exact = numeric.exact_vector(peers.first), None
@@ -169,7 +169,7 @@ def build_class(
     else:
         subsystem = linearize(jacobians, vector, initial_reception)
     return PeerClass(
-        name=group_name(peers, exchange),
+        name=group_name(peers, comm_graph),
         count=len(peers),
         parameters=vector,
         exact_parameters=tuple(exact_vector),
@@ -179,22 +179,22 @@ def build_class(
         schedule=schedule,
         frame_map=lift(subsystem, schedule, exact=exact) if lifted else None,
         peers=peers,
-        delay_class=exchange.delay_class(group),
+        delay_class=comm_graph.delay_class(group),
         index=index,
         initial_reception=initial_reception,
         gains=gains or {},
     )
 
 
-def group_name(peers: PeerIndices, exchange: CommunicationGraph) -> str:
+def group_name(peers: PeerIndices, comm_graph: CommunicationGraph) -> str:
     """Return the name of some peers, such as `left+right[1,3]`.
 
     All peers of a group are named by the group alone.
     """
-    names, starts = [], exchange.starts.tolist()
+    names, starts = [], comm_graph.starts.tolist()
     for group_number, runs in itertools.groupby(peers.runs, key=lambda run: bisect.bisect(starts, run.start)):
         peers_of_group, start = PeerIndices(tuple(runs)), starts[group_number - 1]
-        name = exchange.groups[group_number - 1]
+        name = comm_graph.groups[group_number - 1]
         if len(peers_of_group) < starts[group_number] - start:
             more = ["…"] if len(peers_of_group) > MOST_NAMED else []
             numbers = (str(peer - start + 1) for peer in itertools.islice(peers_of_group, MOST_NAMED))
@@ -210,10 +210,10 @@ def used_coupling_terms(schedules: Iterable[Schedule]) -> tuple[CouplingTerm, ..
     return tuple(sorted({received.coupling_term for schedule in schedules for received in schedule.received}))
 
 
-def incomplete_links(schedules: Iterable[Schedule], exchange: CommunicationGraph) -> list[str]:
+def incomplete_links(schedules: Iterable[Schedule], comm_graph: CommunicationGraph) -> list[str]:
     """Return the links with a reception whose graph is not complete, without repetition."""
     links = dict.fromkeys(coupling_term.link for coupling_term in used_coupling_terms(schedules))
-    return [link for link in links if not exchange.is_complete(link)]
+    return [link for link in links if not comm_graph.is_complete(link)]
 
 
 def states_of(schedule: Schedule, subsystem: SubsystemJacobians) -> int:
@@ -221,23 +221,23 @@ def states_of(schedule: Schedule, subsystem: SubsystemJacobians) -> int:
     return len(subsystem.peer_type.states) + len(schedule.discrete_states) + sum(schedule.depths)
 
 
-def check_size(subsystems: Sequence[SubsystemJacobians], exchange: CommunicationGraph) -> None:
+def check_size(subsystems: Sequence[SubsystemJacobians], comm_graph: CommunicationGraph) -> None:
     """Raise ApcError E804 for different peers with too many states."""
     states = sum(len(subsystem.peer_type.states) for subsystem in subsystems)
     if states > MATRIX_STATES:
-        raise too_large(exchange, f"{len(subsystems):,} different peers", states)
+        raise too_large(comm_graph, f"{len(subsystems):,} different peers", states)
 
 
 # The subject of a refusal that a method without the matrix of all states avoids.
 MATRIX = "the matrix of all states"
 
 
-def too_large(exchange: CommunicationGraph, subject: str, states: int, *, auto: bool = False) -> ApcError:
+def too_large(comm_graph: CommunicationGraph, subject: str, states: int, *, auto: bool = False) -> ApcError:
     """Return the error E804 for a system of too many states.
 
     Parameters
     ----------
-    exchange
+    comm_graph
         The communication graph.
     subject, states
         The peers of the system in words, and its number of states.
@@ -248,7 +248,7 @@ def too_large(exchange: CommunicationGraph, subject: str, states: int, *, auto: 
     return ApcError(
         Diagnostic(
             "E804",
-            SourceLocation(exchange.topology),
+            SourceLocation(comm_graph.topology),
             f"{subject} form one system of {states:,} states; the limit is {MATRIX_STATES:,}",
             advice=f"reduce the number of different peers{spared}",
             subject="" if auto else MATRIX,
@@ -283,7 +283,7 @@ def classes_of_peers(numeric: NumericModel) -> tuple[PeerClass, ...]:
 
 def _classes_of_peers(numeric: NumericModel) -> tuple[PeerClass, ...]:
     """Return peers in classes of equal matrices; if the start affects the matrices, also of equal start."""
-    exchange = numeric.exchange
+    comm_graph = numeric.comm_graph
     by_matrices = all(subsystem.parameters_suffice for subsystem in numeric.subsystems)
     classes = _classes(numeric, by_matrices=True) if by_matrices else start_classes(numeric)
     received: list[tuple[InitialReception | None, Gains]] = [(None, {})] * len(classes)
@@ -293,7 +293,7 @@ def _classes_of_peers(numeric: NumericModel) -> tuple[PeerClass, ...]:
         receptions = [start.reception(g) for g in range(len(classes))]
         indices, classes = _merged_classes(start, receptions, classes)
         received = [*receptions]
-    check_size([numeric.subsystems[exchange.group_of(peers.first)] for peers in classes], exchange)
+    check_size([numeric.subsystems[comm_graph.group_of(peers.first)] for peers in classes], comm_graph)
     return tuple(
         build_class(numeric, index, peers, *received[index])
         for index, peers in zip(indices, classes, strict=True)
@@ -308,15 +308,15 @@ def start_classes(numeric: NumericModel) -> list[PeerIndices]:
     ApcError
         E804 more than MOST_DIFFERENT classes.
     """
-    exchange = numeric.exchange
+    comm_graph = numeric.comm_graph
     classes = _classes(numeric, by_matrices=False)
-    if incomplete_links(numeric.schedules, exchange):  # the senders may differ from peer to peer
+    if incomplete_links(numeric.schedules, comm_graph):  # the senders may differ from peer to peer
         first_peers = itertools.islice(itertools.chain.from_iterable(classes), MOST_DIFFERENT + 1)
         classes = [PeerIndices((range(peer, peer + 1),)) for peer in first_peers]
     if len(classes) > MOST_DIFFERENT:
         message = f"more than {MOST_DIFFERENT} peers with different connections or initial states"
         raise ApcError(
-            Diagnostic("E804", SourceLocation(exchange.topology), f"{message} can't be linearized")
+            Diagnostic("E804", SourceLocation(comm_graph.topology), f"{message} can't be linearized")
         )
     return sorted(classes, key=lambda peers: peers.first)
 
@@ -346,7 +346,7 @@ def _merged_classes(
         key = (
             *(
                 start.peer_types[g],
-                start.exchange.delay_class(start.groups[g]),
+                start.comm_graph.delay_class(start.groups[g]),
                 start.vectors[g].tobytes(),
             ),
             *(initial_reception, tuple(gains.items()), g if not interchangeable else 0),
@@ -366,12 +366,12 @@ def _classes(numeric: NumericModel, *, by_matrices: bool) -> list[PeerIndices]:
     """Return the peers in classes of equal matrices, or of equal parameters, with the same peer type and
     delays.
     """
-    numbers, exchange = numeric.numbers, numeric.exchange
+    numbers, comm_graph = numeric.numbers, numeric.comm_graph
     classes: dict[tuple[int, int, bytes], list[range]] = {}
     for index, group in enumerate(numeric.model.groups):
-        vectors, start = numbers.parameters[index], int(exchange.starts[index])
+        vectors, start = numbers.parameters[index], int(comm_graph.starts[index])
         rows = linearize_rows(numeric.subsystems[index], vectors) if by_matrices else vectors + 0.0
-        keys = [(group.peer_type, exchange.delay_class(index), row.tobytes()) for row in rows]
+        keys = [(group.peer_type, comm_graph.delay_class(index), row.tobytes()) for row in rows]
         key_numbers = {key: count for count, key in enumerate(dict.fromkeys(keys))}
         if len(key_numbers) == 1:
             classes.setdefault(keys[0], []).append(range(start, start + group.count))
@@ -402,7 +402,7 @@ def has_more_states(numeric: NumericModel, states: int) -> bool:
 @cached_in_model
 def representatives(numeric: NumericModel) -> tuple[PeerClass, ...]:
     """Return a class for each group of the model, with the parameters of its first peer, not lifted."""
-    runs = itertools.pairwise(numeric.exchange.starts.tolist())
+    runs = itertools.pairwise(numeric.comm_graph.starts.tolist())
     return tuple(
         build_class(numeric, index, PeerIndices((range(*run),)), lifted=False)
         for index, run in enumerate(runs)

@@ -48,7 +48,7 @@ def count_translations(numeric: NumericModel, populations: Sequence[Heterogeneou
     """
     groups = representatives(numeric)
     total = 0
-    for modal_system in complete_loops(groups, numeric.exchange):
+    for modal_system in complete_loops(groups, numeric.comm_graph):
         free = len(find_rigid_modes(modal_system, with_drifts=False).names)
         if free and not are_common_to_all_peers(
             modal_system, [populations[group.index] for group in modal_system.subsystems]

@@ -133,7 +133,7 @@ class BatchEvaluator:
 
     model: Model
     free: tuple[ParameterRef, ...]
-    exchange: CommunicationGraph
+    comm_graph: CommunicationGraph
     groups: tuple[PeerClass, ...]
     wirings: tuple[LoopStructure, ...]
     durations: Mapping[int, tuple[float, float]]
@@ -190,8 +190,8 @@ class BatchEvaluator:
         the group.
         """
         first = group.peers.first
-        index = self.exchange.group_of(first)
-        return index, first - int(self.exchange.starts[index])
+        index = self.comm_graph.group_of(first)
+        return index, first - int(self.comm_graph.starts[index])
 
     def closed_at(self, value: Sequence[float]) -> tuple[ClosedLoop, ...]:
         """Return the closed systems at one point (m,), as in an analysis: with error bounds."""
@@ -345,7 +345,7 @@ def batch_evaluator(
     model: Model,
     parameter_refs: Sequence[ParameterRef],
     groups: Sequence[PeerClass],
-    exchange: CommunicationGraph,
+    comm_graph: CommunicationGraph,
     *,
     durations: Mapping[int, tuple[float, float]] | None = None,
     follows: bool = True,
@@ -359,7 +359,7 @@ def batch_evaluator(
         The compiled model.
     parameter_refs
         The parameters that vary.
-    groups, exchange
+    groups, comm_graph
         The model's peers at a generic point, from `analysis.lifted_classes`.
     durations
         For a time that varies: the seconds of each step by its quanta, as constant and slope.
@@ -368,7 +368,7 @@ def batch_evaluator(
     matrices
         Whether the systems' matrices are required, or only the maps of the subsystems.
     """
-    systems = split(groups, exchange) if matrices else ()
+    systems = split(groups, comm_graph) if matrices else ()
     if durations is None:
         durations = {
             event.duration: (float(event.duration * group.schedule.quantum), 0.0)
@@ -382,7 +382,7 @@ def batch_evaluator(
     evaluator = BatchEvaluator(
         model=model,
         free=tuple(parameter_refs),
-        exchange=exchange,
+        comm_graph=comm_graph,
         groups=tuple(groups),
         wirings=tuple(loop_structure(closed_system) for closed_system in systems),
         durations=durations,

@@ -172,5 +172,5 @@ def moment_evaluator(
         or not all(np.array_equal(one.neutral, other.neutral) for one, other in neutral)
     ):
         return plain
-    lifts = batch_evaluator(generic_point.model, refs, reception.groups, reception.exchange, matrices=False)
+    lifts = batch_evaluator(generic_point.model, refs, reception.groups, reception.comm_graph, matrices=False)
     return MomentEvaluator(numeric, refs, location, MEAN_SQUARE, lifts, classes, memories, present)

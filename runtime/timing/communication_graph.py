@@ -1,7 +1,7 @@
 """Communication graphs: senders, receivers, weights and delays of the links between the peers of a model.
 
 Takes: a `Model` and its timings.
-Gives: `CommunicationGraph`, `build_exchange`, `check_mean`.
+Gives: `CommunicationGraph`, `build_comm_graph`, `check_mean`.
 Guarantees: a complete graph, a ring and a star cost no more than their arcs.
 Does not: know values or instants (see `scheduling`), or a graph's eigenvalues (see `graph_modes`).
 """
@@ -87,7 +87,7 @@ class CommunicationGraph:
         return f"{name}[{peer - int(self.starts[self.groups.index(name)]) + 1}]"
 
 
-def build_exchange(model: Model, timings: Mapping[str, Fraction]) -> CommunicationGraph:
+def build_comm_graph(model: Model, timings: Mapping[str, Fraction]) -> CommunicationGraph:
     """Return the communication graph of a model; delays of equal value, channel and clock are one timing.
 
     Parameters
@@ -108,7 +108,7 @@ def _cached_graph(
     links: tuple[Link, ...],
     times: tuple[tuple[str, Fraction], ...],
 ) -> CommunicationGraph:
-    """Return the communication graph of `build_exchange`, cached for models with equal times and graphs.
+    """Return the communication graph of `build_comm_graph`, cached for models with equal times and graphs.
 
     Parameters
     ----------

@@ -1,6 +1,6 @@
 """Liveness: the outputs, holds and receives that can affect the motion or the network.
 
-Takes: the structural patterns of a `Model`'s peer types, the exchange.
+Takes: the structural patterns of a `Model`'s peer types, the communication graph.
 Gives: `live_outputs`, `live_holds`, `live_receives`; `ReceptionPattern`, `reception_of`.
 Guarantees: structure alone decides, never a parameter value. There is one coupling term for each delay among
 the senders, without peers that do not send.
@@ -66,7 +66,7 @@ ReceptionPattern = tuple[tuple[tuple[tuple[CouplingTerm, str], ...], ...], ...]
 def reception_of(
     model: Model,
     patterns: Sequence[LinearSubsystem],
-    exchange: CommunicationGraph,
+    comm_graph: CommunicationGraph,
     group: int,
     read: Sequence[frozenset[tuple[int, int]]],
 ) -> ReceptionPattern:
@@ -76,7 +76,7 @@ def reception_of(
 
     Parameters
     ----------
-    model, exchange
+    model, comm_graph
         The compiled model and its communication graph.
     patterns, read
         The structural pattern of each peer type, and its live receives (see `liveness`).
@@ -101,13 +101,13 @@ def reception_of(
                 any(send.link == receive.link for send in model.peer_types[sender.peer_type].sends)
                 for sender in model.groups
             ]
-            senders = exchange.receives(receive.link, group, is_sending)
+            senders = comm_graph.receives(receive.link, group, is_sending)
             if not senders and receive.operator != "sum":
-                peer = int(exchange.starts[group])
-                check_mean(exchange, peer, receive.link, receive.operator, False, Fraction(0))
-            delays = dict.fromkeys(exchange.delay(receive.link, sender, group) for sender in senders)
+                peer = int(comm_graph.starts[group])
+                check_mean(comm_graph, peer, receive.link, receive.operator, False, Fraction(0))
+            delays = dict.fromkeys(comm_graph.delay(receive.link, sender, group) for sender in senders)
             edge = edge_name(partition, receive)
-            clocks = {delay: exchange.links[receive.link].own_clock(delay) for delay in delays}
+            clocks = {delay: comm_graph.links[receive.link].own_clock(delay) for delay in delays}
             receives.append(
                 tuple(
                     (

@@ -20,7 +20,7 @@ from apc.compiler.compiled import Clock, Link, Model, PeerType
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.wording import no_more
 from apc.linearization.linear_subsystem import LinearSubsystem
-from apc.timing.communication_graph import CommunicationGraph, build_exchange
+from apc.timing.communication_graph import CommunicationGraph, build_comm_graph
 from apc.timing.hyperperiod import Times, times_in_use
 from apc.timing.liveness import ReceptionPattern, live_holds, live_outputs, live_receives, reception_of
 from apc.timing.schedule import (
@@ -141,10 +141,10 @@ def _schedules(key: _ScheduleKey) -> tuple[Schedule, ...]:
         dict(key.stored),
     )
     rank = {name: index for index, name in enumerate(order)}
-    exchange = build_exchange(model, timings)
+    comm_graph = build_comm_graph(model, timings)
     live = [live_outputs(pattern) for pattern in patterns]
     read = [live_receives(pattern, outputs) for pattern, outputs in zip(patterns, live, strict=True)]
-    reception = [reception_of(model, patterns, exchange, group, read) for group in range(len(model.groups))]
+    reception = [reception_of(model, patterns, comm_graph, group, read) for group in range(len(model.groups))]
     times = times_in_use(model, timings, patterns, live, reception)
 
     _check_holds(model, patterns, live, times)
@@ -154,7 +154,7 @@ def _schedules(key: _ScheduleKey) -> tuple[Schedule, ...]:
         if (group.peer_type, group_reception) not in receptions:
             received = _received_at_ticks(
                 patterns[group.peer_type],
-                exchange,
+                comm_graph,
                 live[group.peer_type],
                 group_reception,
                 times,
@@ -165,7 +165,7 @@ def _schedules(key: _ScheduleKey) -> tuple[Schedule, ...]:
             for item in (item for row in received.values() for receive in row for item in receive):
                 if isinstance(item, UncertainSample):
                     term = item.coupling_term
-                    link = exchange.links[term.link]
+                    link = comm_graph.links[term.link]
                     slots = times.frame // times.clocks[term.clock or link.clock].period
                     depth |= {term.sample(item.channel, k): stored[link.name] for k in range(slots)}
                 else:
@@ -238,7 +238,7 @@ def _check_depth(model: Model, depth: Mapping[SentSample, int]) -> None:
 
 def _received_at_ticks(
     pattern: LinearSubsystem,
-    exchange: CommunicationGraph,
+    comm_graph: CommunicationGraph,
     live: frozenset[tuple[int, int]],
     reception: ReceptionPattern,
     times: Times,
@@ -251,7 +251,7 @@ def _received_at_ticks(
     ----------
     pattern, live
         The structural pattern of the peer type, and its live outputs.
-    exchange, reception
+    comm_graph, reception
         The communication graph, and the coupling terms of the group's receives.
     times, rank
         All times in quanta, and the rank of each event type among coincident events.
@@ -266,9 +266,11 @@ def _received_at_ticks(
         """Return the entries of r that a tick receives over one coupling term."""
         if coupling_term.link not in stored:
             instant = times.clocks[clock].at(index - coupling_term.before)
-            return (newest(coupling_term, channel, exchange.links[coupling_term.link], instant, times, rank),)
+            return (
+                newest(coupling_term, channel, comm_graph.links[coupling_term.link], instant, times, rank),
+            )
         row = UncertainSample(coupling_term, channel, clock, index)
-        law = exchange.links[coupling_term.link].channel_at(coupling_term.delay)
+        law = comm_graph.links[coupling_term.link].channel_at(coupling_term.delay)
         return (row, replace(row, gap=True)) if law is not None and law.on_loss == "zero" else (row,)
 
     for p in sorted({partition for partition, _ in live}):

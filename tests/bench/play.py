@@ -20,7 +20,7 @@ from apc.realtime.peer_run import RealtimeRun
 from apc.realtime.run_comparison import compare_run
 from apc.realtime.start import LocalRun, run_all
 from apc.simulation.output_blocks import forces_in_time
-from apc.timing.communication_graph import build_exchange
+from apc.timing.communication_graph import build_comm_graph
 from tests.bench.judge import decided, parser_of
 from tests.topologies import AVERAGE, TOPOLOGIES, compiled, replaced
 
@@ -37,8 +37,8 @@ TICK = 1e-3  # seconds of a haptic loop's period
 
 def work_of_a_tick(model: Model) -> tuple[float, int]:
     """Return the processor time of one instant of the first peer, in s, and how many states it has."""
-    exchange = build_exchange(model, resolve(model).timings)
-    names = [exchange.peer_name(one) for one in range(exchange.peers)]
+    comm_graph = build_comm_graph(model, resolve(model).timings)
+    names = [comm_graph.peer_name(one) for one in range(comm_graph.peers)]
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listening:
         addresses = {name: ("127.0.0.1", at + 1) for at, name in enumerate(names[1:])}
         loop = PeerLoop(model, names[0], listening, addresses, digest=bytes(8), duration=Fraction(1))

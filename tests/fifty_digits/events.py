@@ -7,7 +7,7 @@ what it does: no Jacobian of theirs, no schedule, no lifted map, no mode. Shared
 the numbers of each peer (`parameters.resolve`); the walk through a function's operations
 over exact numbers and whether that is possible (`exact.evaluate_exact`, `is_rational`, `guards.guards_of`);
 how a rational becomes a ball (`balls.rational_ball`, `precision`); and in `truth` who hears whom on
-a graph (`exchange.arcs`) and the row of a topology without clocks (`simulation.ROW`). A mistake in one of
+a graph (`comm_graph.arcs`) and the row of a topology without clocks (`simulation.ROW`). A mistake in one of
 these is the reference's too: `tests.bruteforce` and `tests.schemes` share none of them and stand beside it in
 its tests.
 Does not: serve what is not linear between events, or draw lots: it says why.

@@ -106,7 +106,7 @@ def differences(
     quantum = plan.schedules[0].quantum
     marks = [round(float(Fraction(float(t)) / quantum)) for t in course.time]
     running = [
-        Running.started(peer_of(plan, k, how, device=device), folder) for k in range(plan.exchange.peers)
+        Running.started(peer_of(plan, k, how, device=device), folder) for k in range(plan.comm_graph.peers)
     ]
     network = _Network(plan)
     off: dict[str, tuple[float, float]] = {}
@@ -144,7 +144,7 @@ class _Network:
         clocks = {one.name: one for one in plan.model.clocks}
         self.grid = {
             link: (int(timings[own.period] / self.quantum), int(timings[own.phase] / self.quantum))
-            for link, one in plan.exchange.links.items()
+            for link, one in plan.comm_graph.links.items()
             for own in (clocks[one.clock],)
         }
         self.late: dict[tuple[str, int, int], list[float]] = {}
@@ -153,7 +153,7 @@ class _Network:
             if link.channel is None:
                 continue
             law = channel_law(plan.model, link, link.delay)
-            for arc in itertools.permutations(range(plan.exchange.peers), 2):
+            for arc in itertools.permutations(range(plan.comm_graph.peers), 2):
                 used = PacketSource(law, name, [arc], seed=plan.model.experiment.seed).take(MOST_PACKETS)
                 self.late[(name, *arc)] = used[0].tolist()
 
@@ -167,12 +167,12 @@ class _Network:
     def received(self, peer: ExportedPeer, at: int) -> list[float]:
         """Return the numbers that are heard at an instant, in the driver's order."""
         found: list[float] = []
-        exchange, timings = self.plan.exchange, self.plan.numbers.timings
-        groups = np.searchsorted(exchange.starts, np.arange(exchange.peers), side="right") - 1
+        comm_graph, timings = self.plan.comm_graph, self.plan.numbers.timings
+        groups = np.searchsorted(comm_graph.starts, np.arange(comm_graph.peers), side="right") - 1
         for line in peer.lines:
             period, phase = self.grid[line.link]
             for sender in line.senders:
-                late = exchange.delay(line.link, int(groups[sender.peer]), int(groups[peer.number]))
+                late = comm_graph.delay(line.link, int(groups[sender.peer]), int(groups[peer.number]))
                 number, gone = (at - int(timings[late] / self.quantum) - phase) // period, False
                 if (arc := (line.link, sender.peer, peer.number)) in self.late:
                     newest = self.links[line.link].channel.reorder != "all"

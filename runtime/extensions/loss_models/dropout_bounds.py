@@ -168,7 +168,7 @@ def _modes(numeric: NumericModel) -> tuple[list[LossMode], float]:
         link.name for link in model.links if len({channel.loss is None for channel in link.channels}) > 1
     ]:
         raise NotSupportedError(f"only some pairs of groups lose packets of {mixed[0]}")
-    loops = orthogonal_loops(reception.groups, reception.exchange, GAIN_BOUND_STATES)
+    loops = orthogonal_loops(reception.groups, reception.comm_graph, GAIN_BOUND_STATES)
     lossy = frozenset(link.name for link in model.links if link.channel is not None)
     packets = Packets(model, reception)
     packet_numbers = {row: packets.received(row)[0] for row in packets.rows}

@@ -120,7 +120,7 @@ def hold_frame(model: Model, reception: PerTickReception, *, interchangeable: bo
     interchangeable
         Whether the peers are exchangeable.
     """
-    modal_system = dense_loop(reception.groups, reception.exchange)
+    modal_system = dense_loop(reception.groups, reception.comm_graph)
     memories = stored_of(model, reception, modal_system)
     links = {link.name: link for link in model.links}
     received_channels, loss_channels, laws = list[ReceivedChannel](), list[LossChannel](), list[ChannelLaw]()
@@ -201,7 +201,7 @@ def substitution_frame(
     The frame map is the sum over all outcomes of the product of their indicators times their transition
     matrix: the part without ν is A, and the factor of ν_S is F_S.
     """
-    modal_system = dense_loop(reception.groups, reception.exchange)
+    modal_system = dense_loop(reception.groups, reception.comm_graph)
     receivers, offsets, law = receivers_of(model, reception, modal_system, modal_system.coupling)
     senders_of_peers = [np.flatnonzero(receiver.received.any(axis=0)).tolist() for receiver in receivers]
     loss_channels = [(h, g, 0) for h, senders in enumerate(senders_of_peers) for g in senders]

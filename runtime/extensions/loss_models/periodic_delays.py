@@ -183,7 +183,7 @@ def trace_radius(numeric: NumericModel) -> TraceGrowth:
     received = {row: packets.received(row, trace=traces.get(row.coupling_term.link)) for row in packets.rows}
     depths = packets.depths((row, number) for row, numbers in received.items() for number in numbers)
     result = []
-    for modal_system in decompose(packets.reception.groups, packets.reception.exchange).loops:
+    for modal_system in decompose(packets.reception.groups, packets.reception.comm_graph).loops:
         stored = sum(
             depths[sent.link] for subsystem in modal_system.subsystems for sent in subsystem.schedule.sent
         )

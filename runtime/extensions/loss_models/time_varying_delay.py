@@ -93,7 +93,7 @@ def _loop_gain(numeric: NumericModel, delay: ParameterRef, low: Fraction, high: 
     varying_system = replace(middle, links=links)
     reception = build_reception(numeric.at(varying_system))
     refuse_unheld(varying_system, reception)
-    loops = orthogonal_loops(reception.groups, reception.exchange, GAIN_BOUND_STATES)
+    loops = orthogonal_loops(reception.groups, reception.comm_graph, GAIN_BOUND_STATES)
     packets = Packets(varying_system, reception)
     lossy = frozenset(link.name for link in links if link.channel is not None)
     ratios, (weight, sizes) = ratios_of(loops[0].subsystems, lossy), weight_of(loops, lossy)

@@ -140,7 +140,7 @@ def _box_problem(model: Model, ranges: Sequence[Range]) -> _BoxProblem:
     def lifted(changed: Model) -> Any:
         """Return the groups and links of a model with a row of r for each tick."""
         result = build_reception(numeric.at(changed))
-        return result.groups, result.exchange
+        return result.groups, result.comm_graph
 
     # The reference point is inside the box, as a link may have loss probability 0 at an end. It is shifted in
     # each range, because probabilities that add up to exactly 1 are those of bursts.

@@ -65,7 +65,7 @@ def parametric_models(
     subsystem_of_class = {group.index: subsystems.subsystems[group.name] for group in subsystems.groups}
     return [
         (closed_system, tuple(subsystem_of_class[group.index] for group in closed_system.subsystems))
-        for closed_system in split(subsystems.groups, subsystems.exchange)
+        for closed_system in split(subsystems.groups, subsystems.comm_graph)
     ]
 
 
@@ -79,7 +79,7 @@ class ParametricSubsystems:
 
     at: Model
     groups: tuple[PeerClass, ...]
-    exchange: CommunicationGraph
+    comm_graph: CommunicationGraph
     subsystems: Mapping[str, LinearSubsystem]
 
 
@@ -116,14 +116,14 @@ def parametric_subsystems(
         for index, interval in enumerate(ranges, 1)
     ]
     at = apply(model, point)
-    groups, exchange = lifted(at)
+    groups, comm_graph = lifted(at)
     subsystems = {
         group.name: _parametric_subsystem(
-            group, symbolic_parameters[exchange.group_of(group.peers.first)], model
+            group, symbolic_parameters[comm_graph.group_of(group.peers.first)], model
         )
         for group in groups
     }
-    return ParametricSubsystems(at, groups, exchange, subsystems)
+    return ParametricSubsystems(at, groups, comm_graph, subsystems)
 
 
 def _dependent_parameters(

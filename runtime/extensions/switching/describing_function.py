@@ -32,7 +32,7 @@ from apc.spectrum.modes import decompose
 from apc.spectrum.peer_classes import PeerClass
 from apc.spectrum.spectrum import Spectrum, solve_spectrum
 from apc.support.not_supported import NotSupportedError
-from apc.timing.communication_graph import CommunicationGraph, build_exchange
+from apc.timing.communication_graph import CommunicationGraph, build_comm_graph
 
 # Gains tried between 1 and 0, in descending order, and the relative tolerance of a root.
 CELLS, NEAR = 32, 1e-15
@@ -87,11 +87,11 @@ def predict(model: Model, groups: list[tuple[PeerClass, tuple[SectorNonlinearity
     NotSupportedError
         The reason why no limit cycle is predicted.
     """
-    exchange = build_exchange(model, resolve(model).timings)
+    comm_graph = build_comm_graph(model, resolve(model).timings)
 
     def spectrum_at(gain: float) -> Spectrum:
         """Return the spectrum of the loop with linear contacts of this share of their stiffness."""
-        return _spectrum(groups, exchange, gain)
+        return _spectrum(groups, comm_graph, gain)
 
     def excess(gain: float) -> float:
         """Return the excess over 1 of the spectral radius with linear contacts of this share of their
@@ -118,10 +118,12 @@ def predict(model: Model, groups: list[tuple[PeerClass, tuple[SectorNonlinearity
 
 
 def _spectrum(
-    groups: list[tuple[PeerClass, tuple[SectorNonlinearity, ...]]], exchange: CommunicationGraph, gain: float
+    groups: list[tuple[PeerClass, tuple[SectorNonlinearity, ...]]],
+    comm_graph: CommunicationGraph,
+    gain: float,
 ) -> Spectrum:
     """Return the spectrum of the model with linear contacts of a reduced stiffness."""
     scaled_groups = [with_gain(group, forces, Fraction(gain)) for group, forces in groups]
     return solve_spectrum(
-        [close_loop(modal_system) for modal_system in decompose(scaled_groups, exchange).loops]
+        [close_loop(modal_system) for modal_system in decompose(scaled_groups, comm_graph).loops]
     )

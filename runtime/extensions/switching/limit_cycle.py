@@ -33,7 +33,7 @@ from apc.result import Result
 from apc.simulation.trajectory import Trajectory, simulate
 from apc.spectrum.peer_classes import PeerClass
 from apc.support.not_supported import NotSupportedError
-from apc.timing.communication_graph import build_exchange
+from apc.timing.communication_graph import build_comm_graph
 
 Floats = NDArray[np.float64]
 
@@ -188,12 +188,12 @@ def _contacts(
     model: Model, groups: Sequence[tuple[PeerClass, tuple[SectorNonlinearity, ...]]]
 ) -> list[_RecordedContact]:
     """Return the contacts to record: those of the first peers of each group."""
-    exchange = build_exchange(model, resolve(model).timings)
+    comm_graph = build_comm_graph(model, resolve(model).timings)
     peers_per_group = max(1, MOST_PEERS // len(groups))
     result = []
     for group, forces in groups:
         for peer in itertools.islice(group.peers, peers_per_group):
-            name = exchange.peer_name(peer)
+            name = comm_graph.peer_name(peer)
             for push in forces:
                 states = group.jacobians.peer_type.states
                 indices = [k for k, state in enumerate(states) if state.unit == LENGTH and push.slopes[k]]

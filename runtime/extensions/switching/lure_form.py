@@ -139,7 +139,7 @@ def contact_groups(numeric: NumericModel) -> list[tuple[PeerClass, tuple[SectorN
             raise NotSupportedError(f"a force at {group.name} is nonlinear or depends on individual senders")
     pairs = []
     for peers in classes_of_peers(numeric.with_jacobians(on)):
-        type_index = model.groups[numeric.exchange.group_of(peers.peers.first)].peer_type
+        type_index = model.groups[numeric.comm_graph.group_of(peers.peers.first)].peer_type
         forces = (
             contact_force(switched[type_index], part, numeric.jacobians[type_index], peers.parameters)
             for part in parts[type_index]
@@ -194,7 +194,7 @@ def lure_plants(numeric: NumericModel) -> list[LurePlant]:
                 raise NotSupportedError(force.sector)
         cut_classes.append(_cut_peers(group, forces))
     cut_of_class = {item.group.index: item for item in cut_classes}
-    loops = orthogonal_loops([item.group for item in cut_classes], numeric.exchange, LURE_STATES)
+    loops = orthogonal_loops([item.group for item in cut_classes], numeric.comm_graph, LURE_STATES)
     result = []
     for modal_system in loops:
         cut_groups = [cut_of_class[subsystem.index] for subsystem in modal_system.subsystems]
