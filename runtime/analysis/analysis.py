@@ -205,7 +205,7 @@ def _start_limitations(groups: Sequence[PeerClass], *, at_rest: bool) -> tuple[s
     moves = equilibrium_residual(groups)
     if not moves:
         return (NOT_LINEAR,)
-    timed = any(depends_on_time(group.jacobians.peer_type) for group in groups)
+    timed = any(depends_on_time(peer_class.jacobians.peer_type) for peer_class in groups)
     return f"{moves}; {SIMULATED if timed else f'{SIMULATED}; {AT_EQUILIBRIUM}'}", NOT_LINEAR
 
 
@@ -421,11 +421,15 @@ def _neutral_modes(
     systems: Sequence[tuple[ModalSystem, int]] = [
         (modal_system, modal_system.multiplicity) for modal_system in loops
     ]
-    for group in population:
+    for peer_class in population:
         generic_coupling = {
-            coupling_term: ((Fraction(-1, 3),),) for coupling_term in used_coupling_terms([group.schedule])
+            coupling_term: ((Fraction(-1, 3),),)
+            for coupling_term in used_coupling_terms([peer_class.schedule])
         }
-        systems = [*systems, (ModalSystem(group.name, 1, (group,), generic_coupling), group.count)]
+        systems = [
+            *systems,
+            (ModalSystem(peer_class.name, 1, (peer_class,), generic_coupling), peer_class.count),
+        ]
     with_drifts = bool(spectrum.drifts and loops)
     pairs = [
         (classify_neutral_modes(modal_system, with_drifts=with_drifts), multiplicity)
@@ -444,9 +448,9 @@ def _neutral_modes(
     )
 
 
-def _has_other_states(group: PeerClass) -> bool:
+def _has_other_states(peer_class: PeerClass) -> bool:
     """Return whether peers have states other than lengths and their rates."""
-    peer_type = group.jacobians.peer_type
+    peer_type = peer_class.jacobians.peer_type
     return any(clock.memories for clock in peer_type.clocks) or any(
         state.unit.partition("/")[0] != LENGTH for state in peer_type.states
     )

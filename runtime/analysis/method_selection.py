@@ -142,16 +142,21 @@ def make_plan(numeric: NumericModel, method: str = "auto") -> AnalysisPlan:
             raise cannot_serve(model, method, decomposed.notes[0])
         loops, chosen_method, notes = decomposed.loops, decomposed.method, decomposed.notes
         packets = max(
-            sum(sum(group.schedule.depths) for group in modal_system.subsystems) for modal_system in loops
+            sum(sum(peer_class.schedule.depths) for peer_class in modal_system.subsystems)
+            for modal_system in loops
         )
         stored_outputs = max(
-            sum(len(group.schedule.discrete_states) for group in modal_system.subsystems)
+            sum(len(peer_class.schedule.discrete_states) for peer_class in modal_system.subsystems)
             for modal_system in loops
         )
         if method == "determinant":
             chosen_method = method
         elif method == "auto" and (
-            any(_long_lines(group.schedule) for modal_system in loops for group in modal_system.subsystems)
+            any(
+                _long_lines(peer_class.schedule)
+                for modal_system in loops
+                for peer_class in modal_system.subsystems
+            )
             or (
                 packets + stored_outputs > LONG_LINES
                 and max(modal_system.states for modal_system in loops) > MATRIX_STATES
@@ -197,7 +202,7 @@ def _long_lines(schedule: Schedule) -> bool:
 
 def is_large_ring(groups: Sequence[PeerClass], comm_graph: CommunicationGraph) -> bool:
     """Return whether all peers are equal and form one ring of more than LARGEST_RING peers."""
-    coupling_terms = used_coupling_terms(group.schedule for group in groups)
+    coupling_terms = used_coupling_terms(peer_class.schedule for peer_class in groups)
     shapes = {comm_graph.links[coupling_term.link].graph.shape for coupling_term in coupling_terms}
     if len(groups) > 1 or shapes != {"ring"} or comm_graph.peers <= LARGEST_RING:
         return False
@@ -213,7 +218,7 @@ def cannot_serve(model: Model, method: str, reason: str) -> ApcError:
 def _sizes(loops: Sequence[ModalSystem], method: str) -> tuple[tuple[int, int], ...]:
     """Return (count, size) of the loops: the size is in states, or in rows of the determinant."""
     sizes = Counter(
-        sum(len(group.schedule.sent) for group in modal_system.subsystems)
+        sum(len(peer_class.schedule.sent) for peer_class in modal_system.subsystems)
         if method == "determinant"
         else modal_system.states
         for modal_system in loops
@@ -225,8 +230,8 @@ def _determinant_memory(modal_system: ModalSystem) -> int:
     """Return the memory in bytes of a loop's determinant, given by its numbers of sent and received
     values.
     """
-    entries = sum(len(subsystem.schedule.sent) for subsystem in modal_system.subsystems) * sum(
-        len(subsystem.schedule.received) for subsystem in modal_system.subsystems
+    entries = sum(len(peer_class.schedule.sent) for peer_class in modal_system.subsystems) * sum(
+        len(peer_class.schedule.received) for peer_class in modal_system.subsystems
     )
     return (CACHE_SIZE_OF_SUBSYSTEM * len(modal_system.subsystems) + SUBSYSTEM_AT_WORK) * entries
 

@@ -143,18 +143,21 @@ class FrameNumbers:
 
 
 def steps_in_floats(
-    group: PeerClass, forces: Sequence[ForceInput], count: int, durations: Sequence[Fraction]
+    peer_class: PeerClass, forces: Sequence[ForceInput], count: int, durations: Sequence[Fraction]
 ) -> list[Matrix]:
     """Return [F G] of some durations in floats, from exact matrices (see `FrameNumbers`)."""
-    columns = np.zeros((len(group.exact.a), count), dtype=object)
+    columns = np.zeros((len(peer_class.exact.a), count), dtype=object)
     for index, push in enumerate(forces):
         columns[list(push.velocities), index] = push.inverses
-    steps = discretize(group.exact.a, np.concatenate([group.exact.b, columns], axis=1), durations)
+    steps = discretize(peer_class.exact.a, np.concatenate([peer_class.exact.b, columns], axis=1), durations)
     return [value_of(step) for step in steps]
 
 
 IN_FLOATS = FrameNumbers(
-    lambda group: group.subsystem, lambda group, push: [*map(float, push.inverses)], steps_in_floats, FLOATS
+    lambda peer_class: peer_class.subsystem,
+    lambda peer_class, push: [*map(float, push.inverses)],
+    steps_in_floats,
+    FLOATS,
 )
 
 
@@ -240,11 +243,13 @@ def lifted(
     """
     with single_threaded(), finite_equations(model.name), np.errstate(all="ignore"):
         link = _link_of(model, open_at)
-        driven_peers = [_open_loop(model, group, "" if link else open_at, numbers) for group in groups]
+        driven_peers = [
+            _open_loop(model, peer_class, "" if link else open_at, numbers) for peer_class in groups
+        ]
         _check_size(model, driven_peers)
-        modal_system = dense_loop([item.group for item in driven_peers], comm_graph)
-        peers_of_class = {item.group.index: item for item in driven_peers}
-        subsystems = [peers_of_class[subsystem.index] for subsystem in modal_system.subsystems]
+        modal_system = dense_loop([item.peer_class for item in driven_peers], comm_graph)
+        peers_of_class = {item.peer_class.index: item for item in driven_peers}
+        subsystems = [peers_of_class[peer_class.index] for peer_class in modal_system.subsystems]
         blocks, labels = _closed(
             modal_system, subsystems, link=link, open_at=open_at, arithmetic=numbers.arithmetic
         )
@@ -254,14 +259,14 @@ def lifted(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _DrivenPeers:
-    """Peers with external inputs: `group` includes the inputs, `map` is their frame map.
+    """Peers with external inputs: `peer_class` includes the inputs, `map` is their frame map.
 
     `signals` are the simulated signals with their indices in z, `inputs` the inputs with their indices.
     `cuts` are the forces cut open, with the indices of their computed values in z; the last received values
     replace these. `unpushed` lists the bodies without force input, with the reason.
     """
 
-    group: PeerClass
+    peer_class: PeerClass
     map: FrameMap
     signals: Placed
     inputs: Placed
@@ -269,12 +274,12 @@ class _DrivenPeers:
     unpushed: tuple[str, ...]
 
 
-def _open_loop(model: Model, group: PeerClass, open_at: str, numbers: FrameNumbers) -> _DrivenPeers:
+def _open_loop(model: Model, peer_class: PeerClass, open_at: str, numbers: FrameNumbers) -> _DrivenPeers:
     """Return some peers with forces and noise as inputs, and with the forces of a coupler cut open."""
-    schedule, peer_type = _with_computed_values(group), group.jacobians.peer_type
-    (forces, unpushed), noises = _force_inputs(model, group), _sampled_states(group.subsystem)
-    inverses = [numbers.inverses(group, force) for force in forces]
-    extended = _with_inputs(numbers.subsystem(group), forces, inverses, noises)
+    schedule, peer_type = _with_computed_values(peer_class), peer_class.jacobians.peer_type
+    (forces, unpushed), noises = _force_inputs(model, peer_class), _sampled_states(peer_class.subsystem)
+    inverses = [numbers.inverses(peer_class, force) for force in forces]
+    extended = _with_inputs(numbers.subsystem(peer_class), forces, inverses, noises)
     count = len(forces) + len(noises)
     no_readings = np.zeros((0, sum(extended.b.shape)), dtype=extended.b.dtype)
     (subsystem,), extended_schedule, ports = with_ports([extended], schedule, count, [0], [no_readings], [])
@@ -282,7 +287,7 @@ def _open_loop(model: Model, group: PeerClass, open_at: str, numbers: FrameNumbe
     check_packets(extended_schedule)
     durations = step_durations(extended_schedule)
     steps = numbers.steps(
-        group, forces, count, [duration * extended_schedule.quantum for duration in durations]
+        peer_class, forces, count, [duration * extended_schedule.quantum for duration in durations]
     )
     frame = compose(
         subsystem, extended_schedule, dict(zip(durations, steps, strict=True)), numbers=numbers.arithmetic
@@ -295,7 +300,7 @@ def _open_loop(model: Model, group: PeerClass, open_at: str, numbers: FrameNumbe
             if local_signal.role == "state"
             else first[ClockedValue(local_signal.index[0], local_signal.index[1], -1)],
         )
-        for local_signal in local_signals(peer_type, group.schedule)
+        for local_signal in local_signals(peer_type, peer_class.schedule)
         if local_signal.role in ("state", "output")
     ]
     inputs = [ExportedSignal(f"force on {push.part}", "N") for push in forces]
@@ -304,8 +309,8 @@ def _open_loop(model: Model, group: PeerClass, open_at: str, numbers: FrameNumbe
         for index in noises
     ]
     return _DrivenPeers(
-        group=group.with_subsystem(
-            subsystem, group.exact, extended_schedule, frame.mapped(MIDPOINT_RADIUS.exact)
+        peer_class=peer_class.with_subsystem(
+            subsystem, peer_class.exact, extended_schedule, frame.mapped(MIDPOINT_RADIUS.exact)
         ),
         map=frame,
         signals=signals,
@@ -315,9 +320,9 @@ def _open_loop(model: Model, group: PeerClass, open_at: str, numbers: FrameNumbe
     )
 
 
-def _with_computed_values(group: PeerClass) -> Schedule:
+def _with_computed_values(peer_class: PeerClass) -> Schedule:
     """Return a peer's schedule with the last computed values of its clocks among the discrete states."""
-    schedule, peer_type = group.schedule, group.jacobians.peer_type
+    schedule, peer_type = peer_class.schedule, peer_class.jacobians.peer_type
     tick_times = _instants(schedule)
     values = [
         ClockedValue(p, o, -1)
@@ -347,13 +352,20 @@ def _instants(schedule: Schedule) -> dict[int, list[int]]:
     return result
 
 
-def _force_inputs(model: Model, group: PeerClass) -> tuple[list[ForceInput], list[str]]:
+def _force_inputs(model: Model, peer_class: PeerClass) -> tuple[list[ForceInput], list[str]]:
     """Return the force inputs of a peer's bodies, axis by axis, and the reasons for bodies without one."""
     unit_of = {parameter.name: parameter.unit for parameter in model.parameters}
     device_cache: dict[str, Device | str | None] = {}
     result = [
-        find_push(group.jacobians, group.parameters, unit_of, group.initial_reception, index, device_cache)
-        for index, state in enumerate(group.jacobians.peer_type.states)
+        find_push(
+            peer_class.jacobians,
+            peer_class.parameters,
+            unit_of,
+            peer_class.initial_reception,
+            index,
+            device_cache,
+        )
+        for index, state in enumerate(peer_class.jacobians.peer_type.states)
         if state.unit == "m"
     ]
     pushes: dict[str, ForceInput] = {}
@@ -443,10 +455,13 @@ def _cut_open(
 
 def _check_size(model: Model, opened: Sequence[_DrivenPeers]) -> None:
     """Raise ApcError E951 for a model whose matrix exceeds the memory."""
-    columns = sum(item.group.count * states_of(item.group.schedule, item.group.jacobians) for item in opened)
-    peers = sum(item.group.count for item in opened)
+    columns = sum(
+        item.peer_class.count * states_of(item.peer_class.schedule, item.peer_class.jacobians)
+        for item in opened
+    )
+    peers = sum(item.peer_class.count for item in opened)
     message = f"{columns:,} × {columns:,} numbers (states and inputs of {peers:,} peers)"
-    first = max(opened, key=lambda opened: opened.group.count).group
+    first = max(opened, key=lambda opened: opened.peer_class.count).peer_class
     advice = (
         "reduce the number of peers, such as by --set "
         f"{model.groups[0].name if len(opened) == 1 else first.name}.count=10"
@@ -475,8 +490,8 @@ def _closed(
         The number type.
     """
     layout = lay_out_loop(modal_system)
-    n, peers = len(layout.names), [subsystem.name for subsystem in modal_system.subsystems]
-    received = [subsystem.group.schedule.received for subsystem in subsystems]
+    n, peers = len(layout.names), [peer_class.name for peer_class in modal_system.subsystems]
+    received = [subsystem.peer_class.schedule.received for subsystem in subsystems]
     external_rows = [
         [
             row
@@ -507,7 +522,7 @@ def _closed(
     stored = np.delete(np.arange(n), np.concatenate([input_slots, computed]))
     names = layout.names if len(subsystems) > 1 else tuple(f"{peers[0]}.{name}" for name in layout.names)
     units = {
-        name: _units(subsystem.group.jacobians.peer_type)
+        name: _units(subsystem.peer_class.jacobians.peer_type)
         for name, subsystem in zip(peers, subsystems, strict=True)
     }
     states = tuple(ExportedSignal(name, _unit(units, name)) for name in map(names.__getitem__, stored))

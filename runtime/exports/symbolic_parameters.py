@@ -77,13 +77,13 @@ def state_space_of(model: Model, *, open_at: str = "", symbolic: Sequence[str] =
         message = "the point of linearization depends on more than the parameters"
         raise ApcError(Diagnostic("E954", SourceLocation(OPTION), message, advice=f"omit {OPTION}"))
     groups, comm_graph = peers_of(numeric)
-    groups = tuple(part for group in groups for part in _split_by_groups(group, comm_graph))
+    groups = tuple(part for peer_class in groups for part in _split_by_groups(peer_class, comm_graph))
     values = dict(zip(parameter_refs, symbols, strict=True))
 
-    def vector(group: PeerClass) -> Any:
+    def vector(peer_class: PeerClass) -> Any:
         """Return the parameters of a group's first peer as CasADi expressions."""
-        index = comm_graph.group_of(group.peers.first)
-        peer = group.peers.first - int(comm_graph.starts[index])
+        index = comm_graph.group_of(peer_class.peers.first)
+        peer = peer_class.peers.first - int(comm_graph.starts[index])
         entries = free_values(model, model.groups[index], peer, values, symbolic_function)
         return casadi.vertcat(*map(casadi.SX, entries))
 
@@ -117,45 +117,47 @@ def _parameter_refs(model: Model, names: Sequence[str]) -> list[ParameterRef]:
     return parameter_refs
 
 
-def _split_by_groups(group: PeerClass, comm_graph: CommunicationGraph) -> list[PeerClass]:
+def _split_by_groups(peer_class: PeerClass, comm_graph: CommunicationGraph) -> list[PeerClass]:
     """Return a class of equal peers split by the model's groups, as a parameter of one group may be free."""
-    runs = itertools.groupby(group.peers.runs, key=lambda run: comm_graph.group_of(run.start))
+    runs = itertools.groupby(peer_class.peers.runs, key=lambda run: comm_graph.group_of(run.start))
     parts = [PeerIndices(tuple(runs_of_group)) for _, runs_of_group in runs]
-    return [replace(group, peers=peers, count=len(peers)) for peers in parts]
+    return [replace(peer_class, peers=peers, count=len(peers)) for peers in parts]
 
 
 def _numbers(vector: Callable[[PeerClass], Any]) -> FrameNumbers:
     """Return the numerical parts of a frame, as CasADi expressions of each group's parameters (n_p,)."""
 
-    def values(function: Any, group: PeerClass) -> list[Any]:
+    def values(function: Any, peer_class: PeerClass) -> list[Any]:
         """Return the nonzeros of a function at a group's parameters, with zeros for all other arguments."""
         other_arguments = [casadi.DM.zeros(*function.size_in(index)) for index in range(function.n_in() - 2)]
         return [
             _constant_or_expression(nonzero)
-            for nonzero in function(*other_arguments, vector(group), 0).nonzeros()
+            for nonzero in function(*other_arguments, vector(peer_class), 0).nonzeros()
         ]
 
-    def subsystem(group: PeerClass) -> LinearSubsystem:
+    def subsystem(peer_class: PeerClass) -> LinearSubsystem:
         """Return the matrices of a group of peers."""
-        return subsystem_of_entries(group.jacobians, values(group.jacobians.function, group), 0)
+        return subsystem_of_entries(
+            peer_class.jacobians, values(peer_class.jacobians.function, peer_class), 0
+        )
 
-    def inverses(group: PeerClass, push: ForceInput) -> list[Any]:
+    def inverses(peer_class: PeerClass, push: ForceInput) -> list[Any]:
         """Return the effects of a force on velocities, per newton."""
-        return values(push.symbolic, group)
+        return values(push.symbolic, peer_class)
 
     def steps(
-        group: PeerClass, forces: Sequence[ForceInput], count: int, durations: Sequence[Fraction]
+        peer_class: PeerClass, forces: Sequence[ForceInput], count: int, durations: Sequence[Fraction]
     ) -> list[Matrix]:
         """Return [F G] for each duration, with `count` inputs after the holds."""
-        matrices = subsystem(group)
+        matrices = subsystem(peer_class)
         generator_rows = np.concatenate(
             [matrices.a, matrices.b, np.zeros((len(matrices.a), count))], axis=1
         ).astype(object)
         for index, push in enumerate(forces, generator_rows.shape[1] - count):
-            generator_rows[list(push.velocities), index] = inverses(group, push)
+            generator_rows[list(push.velocities), index] = inverses(peer_class, push)
         if not any(isinstance(item, casadi.SX) for item in generator_rows.flat):
-            return [matrix.astype(object) for matrix in steps_in_floats(group, forces, count, durations)]
-        return [_step(generator_rows, group.subsystem.a, float(duration)) for duration in durations]
+            return [matrix.astype(object) for matrix in steps_in_floats(peer_class, forces, count, durations)]
+        return [_step(generator_rows, peer_class.subsystem.a, float(duration)) for duration in durations]
 
     return FrameNumbers(subsystem, inverses, steps, SYMBOLS)
 

@@ -70,7 +70,7 @@ class _DeviceInput:
     indices of inputs and readings in z.
     """
 
-    group: PeerClass
+    peer_class: PeerClass
     damping: Fraction
     seconds: tuple[Fraction, ...]
     ports: FrameInputs
@@ -128,8 +128,8 @@ def port_loops(numeric: NumericModel, *, option: str) -> tuple[PortLoop, ...]:
     )
     received = {
         (receive.link, row)
-        for group in groups
-        for partition, tick in zip(group.jacobians.peer_type.clocks, group.exact.ticks, strict=True)
+        for peer_class in groups
+        for partition, tick in zip(peer_class.jacobians.peer_type.clocks, peer_class.exact.ticks, strict=True)
         for receive, column, rows in zip(partition.receives, tick.r.T, tick.channels, strict=True)
         if column.astype(np.bool_).any()
         for row in rows
@@ -137,32 +137,32 @@ def port_loops(numeric: NumericModel, *, option: str) -> tuple[PortLoop, ...]:
     direct = coupled_directly(model.peer_types)
     device_inputs: dict[int, _DeviceInput] = {}
     with_inputs: list[PeerClass] = []
-    for group in groups:
+    for peer_class in groups:
         device = find_device(
-            group.jacobians, group.parameters, unit_of, group.initial_reception, direct=direct
+            peer_class.jacobians, peer_class.parameters, unit_of, peer_class.initial_reception, direct=direct
         )
         if device is None:  # for example a server, without a hand
-            with_inputs.append(group)
+            with_inputs.append(peer_class)
             continue
         if isinstance(device, str):
             raise ApcError(Diagnostic("E931", location, f"{option}: {device}"))
-        if reason := _velocity_use(group, device, received):
+        if reason := _velocity_use(peer_class, device, received):
             raise NotSupportedError(reason)
-        if interaction := _unsupported_interaction(group, device):
+        if interaction := _unsupported_interaction(peer_class, device):
             why, advice = interaction
             raise ApcError(Diagnostic("E933", location, f"{option}: {why}", advice=advice))
-        device_input = _with_device_input(group, device)
-        device_inputs[group.index] = device_input
-        with_inputs.append(device_input.group)
+        device_input = _with_device_input(peer_class, device)
+        device_inputs[peer_class.index] = device_input
+        with_inputs.append(device_input.peer_class)
     if not device_inputs:
         raise no_device(model, option)
-    used = {received.coupling_term.link for group in groups for received in group.schedule.received}
+    used = {received.coupling_term.link for peer_class in groups for received in peer_class.schedule.received}
     is_orthogonal = all(comm_graph.links[link].graph.shape in ORTHOGONAL for link in used)
     loops, weighted = accepted_loops(with_inputs, comm_graph, lambda _: is_orthogonal, option)
     result = []
     for modal_system in loops:
         # A loop without devices is one of the model with its devices clamped.
-        if any(subsystem.index in device_inputs for subsystem in modal_system.subsystems):
+        if any(peer_class.index in device_inputs for peer_class in modal_system.subsystems):
             represents_all = weighted and len(modal_system.subsystems) > 1
             result.append(
                 _port_loop(
@@ -176,38 +176,38 @@ def port_loops(numeric: NumericModel, *, option: str) -> tuple[PortLoop, ...]:
     return tuple(result)
 
 
-def _velocity_use(group: PeerClass, device: Device, received: Set[tuple[str, int]]) -> str:
+def _velocity_use(peer_class: PeerClass, device: Device, received: Set[tuple[str, int]]) -> str:
     """Return the reason if a device's velocity is sampled or sent, "" otherwise.
 
     Only channels that some peer receives count.
     """
-    peer_type = group.jacobians.peer_type
-    for partition, tick in zip(peer_type.clocks, group.exact.ticks, strict=True):
+    peer_type = peer_class.jacobians.peer_type
+    for partition, tick in zip(peer_type.clocks, peer_class.exact.ticks, strict=True):
         for row in np.flatnonzero(tick.x[:, device.velocity].astype(np.bool_)):
             name = partition.outputs[row % len(partition.outputs)]
             return (
                 f"{name} samples the velocity of {device.part}; an arbitrarily small motion of the operator "
                 "can cause any force"
             )
-    for sending, send in zip(peer_type.sends, group.exact.sends, strict=True):
+    for sending, send in zip(peer_type.sends, peer_class.exact.sends, strict=True):
         rows = np.flatnonzero(send.x[:, device.velocity].astype(np.bool_))
         if any((sending.link, row) in received for row in rows.tolist()):
             return f"the velocity of {device.part} is sent over {sending.link} as sampled"
     return ""
 
 
-def _unsupported_interaction(group: PeerClass, device: Device) -> tuple[str, str] | None:
+def _unsupported_interaction(peer_class: PeerClass, device: Device) -> tuple[str, str] | None:
     """Return a signal of a device other than samples and held forces, with advice on a replacement.
 
     The result is None without such a signal.
     """
-    a, device_states = group.exact.a, [device.position, device.velocity]
+    a, device_states = peer_class.exact.a, [device.position, device.velocity]
     others = [index for index in range(len(a)) if index not in device_states]
     coupled = a[np.ix_(others, device_states)].astype(np.bool_) | a[np.ix_(device_states, others)].T.astype(
         np.bool_
     )
     if coupled.any():
-        name = group.jacobians.peer_type.states[others[int(np.flatnonzero(coupled.any(axis=1))[0])]].name
+        name = peer_class.jacobians.peer_type.states[others[int(np.flatnonzero(coupled.any(axis=1))[0])]].name
         return (
             f"{device.part} is coupled to {name} in continuous time",
             "use a coupler with sample and hold, such as SampledSpringDamper",
@@ -217,14 +217,14 @@ def _unsupported_interaction(group: PeerClass, device: Device) -> tuple[str, str
     return None
 
 
-def _with_device_input(group: PeerClass, device: Device) -> _DeviceInput:
+def _with_device_input(peer_class: PeerClass, device: Device) -> _DeviceInput:
     """Return a class of peers with the displacement of its device as an input."""
-    schedule = group.schedule
-    instants = _interval_starts(group.exact, schedule, device)
+    schedule = peer_class.schedule
+    instants = _interval_starts(peer_class.exact, schedule, device)
     with_position_input, readings = [], []
     for linear_subsystem, inverse in (
-        (group.subsystem, float(device.inverse)),
-        (group.exact, device.inverse),
+        (peer_class.subsystem, float(device.inverse)),
+        (peer_class.exact, device.inverse),
     ):
         with_position_input.append(_without_device_states(linear_subsystem, device))
         reading = np.zeros((1, sum(with_position_input[-1].b.shape)), dtype=linear_subsystem.b.dtype)
@@ -234,8 +234,8 @@ def _with_device_input(group: PeerClass, device: Device) -> _DeviceInput:
         with_position_input, schedule, 1, instants, readings, instants
     )
     seconds = tuple(end * schedule.quantum for end in np.diff([*instants, schedule.frame]).tolist())
-    damping = -group.exact.a[device.velocity, device.velocity] / device.inverse
-    return _DeviceInput(group.with_subsystem(subsystem, exact, full), damping, seconds, ports)
+    damping = -peer_class.exact.a[device.velocity, device.velocity] / device.inverse
+    return _DeviceInput(peer_class.with_subsystem(subsystem, exact, full), damping, seconds, ports)
 
 
 def _interval_starts(subsystem: LinearSubsystem, schedule: Schedule, device: Device) -> list[int]:
@@ -299,7 +299,9 @@ def _port_loop(
         The location and the command-line option, for messages.
     """
     gripped = [
-        number for number, subsystem in enumerate(modal_system.subsystems) if subsystem.index in device_inputs
+        number
+        for number, peer_class in enumerate(modal_system.subsystems)
+        if peer_class.index in device_inputs
     ]
     subsystems = [device_inputs[modal_system.subsystems[number].index] for number in gripped]
     counts = [modal_system.subsystems[number].count if represents_all else 1 for number in gripped]

@@ -62,7 +62,7 @@ class DrivenPeer:
     in z of the increments at the ends of intervals, and of the states and holds read at their starts.
     """
 
-    group: PeerClass
+    peer_class: PeerClass
     device: Device | None
     a: Matrix
     b: Matrix
@@ -74,7 +74,7 @@ class DrivenPeer:
     @property
     def states(self) -> tuple[str, ...]:
         """The names of the continuous states."""
-        return tuple(state.name for state in self.group.jacobians.peer_type.states)
+        return tuple(state.name for state in self.peer_class.jacobians.peer_type.states)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -98,13 +98,13 @@ class DrivenMode:
     frame: Fraction
 
 
-def driven_subsystem(group: PeerClass, device: Device | None) -> tuple[PeerClass, DrivenPeer]:
+def driven_subsystem(peer_class: PeerClass, device: Device | None) -> tuple[PeerClass, DrivenPeer]:
     """Return a class of peers with increments of its states as inputs, and readings of states and holds."""
-    schedule = group.schedule
+    schedule = peer_class.schedule
     starts, seconds = _intervals(schedule)
-    n_x, n_u = group.subsystem.b.shape
+    n_x, n_u = peer_class.subsystem.b.shape
     subsystems, readings = [], []
-    for linear_subsystem in (group.subsystem, group.exact):
+    for linear_subsystem in (peer_class.subsystem, peer_class.exact):
         subsystems.append(
             with_holds(linear_subsystem, np.zeros((n_x, n_x + 1), dtype=linear_subsystem.b.dtype))
         )
@@ -117,7 +117,9 @@ def driven_subsystem(group: PeerClass, device: Device | None) -> tuple[PeerClass
     (subsystem, exact), full, ports = with_ports(subsystems, schedule, n_x + 1, starts, readings, starts)
     check_packets(full)
     durations = step_durations(full)
-    steps = discretize(group.exact.a, group.exact.b, [duration * full.quantum for duration in durations])
+    steps = discretize(
+        peer_class.exact.a, peer_class.exact.b, [duration * full.quantum for duration in durations]
+    )
     # At the end of a step each additional hold adds its value to one state.
     increment_columns = MIDPOINT_RADIUS.exact(np.eye(n_x, n_x + 1))
     extended_steps = [np.concatenate([step, increment_columns], axis=-1) for step in steps]
@@ -131,12 +133,12 @@ def driven_subsystem(group: PeerClass, device: Device | None) -> tuple[PeerClass
     if device is not None:
         push[0, device.velocity] = float(device.inverse)
         push[1, device.velocity] = UNIT_ROUNDOFF * abs(float(device.inverse))
-    peer_group = group.with_subsystem(subsystem, exact, full, lifted)
+    peer_group = peer_class.with_subsystem(subsystem, exact, full, lifted)
     return peer_group, DrivenPeer(
-        group=group,
+        peer_class=peer_class,
         device=device,
-        a=rounded(group.subsystem.a, COEFFICIENT_ROUNDINGS),
-        b=rounded(group.subsystem.b, COEFFICIENT_ROUNDINGS),
+        a=rounded(peer_class.subsystem.a, COEFFICIENT_ROUNDINGS),
+        b=rounded(peer_class.subsystem.b, COEFFICIENT_ROUNDINGS),
         push=push,
         seconds=tuple(second * schedule.quantum for second in seconds),
         starts=tuple(number * schedule.quantum for number in starts),
@@ -164,7 +166,7 @@ def driven_mode(modal_system: ModalSystem, subsystems: Mapping[int, DrivenPeer])
         The loop of classes from `driven_subsystem`, and their driven peers by the index of the class.
     """
     closed = close_loop(modal_system)
-    driven_peers = [subsystems[group.index] for group in modal_system.subsystems]
+    driven_peers = [subsystems[peer_class.index] for peer_class in modal_system.subsystems]
     closed_matrix = with_error_radius(closed.matrix, closed.error)
     pairs = list(zip(closed.offsets, driven_peers, strict=True))
     added = [start + index for start, subsystem in pairs for index in subsystem.ports.added]
@@ -192,7 +194,7 @@ def driven_mode(modal_system: ModalSystem, subsystems: Mapping[int, DrivenPeer])
         d=closed_matrix[:, output_indices[:, None], input_indices],
         forced_increments=positions[0],
         reads=positions[1],
-        frame=driven_peers[0].group.schedule.frame_s,
+        frame=driven_peers[0].peer_class.schedule.frame_s,
     )
 
 

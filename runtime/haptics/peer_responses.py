@@ -73,21 +73,25 @@ def responses(numeric: NumericModel, port: DevicePort, other: DevicePort) -> Res
     unit_of = {parameter.name: parameter.unit for parameter in model.parameters}
     direct = coupled_directly(model.peer_types)
     driven_classes, subsystems, gripped = [], {}, {}
-    for group in groups:
+    for peer_class in groups:
         device = None
         for device_port in (other, port):
-            if device_port.peer not in group.peers:
+            if device_port.peer not in peer_class.peers:
                 continue
-            has_axis = port.peer in group.peers or whole_and_index(port.part)[1]
+            has_axis = port.peer in peer_class.peers or whole_and_index(port.part)[1]
             part_name = device_port.part or (port.part if has_axis else "")
-            gripped[device_port] = device = _gripped_device(numeric, group, part_name, unit_of)
+            gripped[device_port] = device = _gripped_device(numeric, peer_class, part_name, unit_of)
         if device is None:
             result = find_device(
-                group.jacobians, group.parameters, unit_of, group.initial_reception, direct=direct
+                peer_class.jacobians,
+                peer_class.parameters,
+                unit_of,
+                peer_class.initial_reception,
+                direct=direct,
             )
             device = result if isinstance(result, Device) else None
-        _check_increments(model, group)
-        peer_group, subsystem = driven_subsystem(group, device)
+        _check_increments(model, peer_class)
+        peer_group, subsystem = driven_subsystem(peer_class, device)
         driven_classes.append(peer_group)
         subsystems[peer_group.index] = subsystem
     plain, driven_loops = (
@@ -95,7 +99,7 @@ def responses(numeric: NumericModel, port: DevicePort, other: DevicePort) -> Res
         for classes in (groups, driven_classes)
     )
     common = driven_loops[0]
-    if (states := sum(len(subsystem.z_names) for subsystem in common.subsystems)) > MOST_TOGETHER:
+    if (states := sum(len(peer_class.z_names) for peer_class in common.subsystems)) > MOST_TOGETHER:
         message = f"{len(common.subsystems):,} different peers have {states:,} states and samples in a frame"
         advice = f"reduce the number of different peers (limit: {MOST_TOGETHER:,})"
         raise ApcError(
@@ -105,7 +109,9 @@ def responses(numeric: NumericModel, port: DevicePort, other: DevicePort) -> Res
         )
     driven_index, other_index = (
         next(
-            index for index, subsystem in enumerate(common.subsystems) if device_port.peer in subsystem.peers
+            index
+            for index, peer_class in enumerate(common.subsystems)
+            if device_port.peer in peer_class.peers
         )
         for device_port in (port, other)
     )
@@ -121,7 +127,7 @@ def responses(numeric: NumericModel, port: DevicePort, other: DevicePort) -> Res
         other=gripped[other],
         loops=tuple(driven_mode(modal_system, subsystems) for modal_system in driven_loops),
         plain=plain,
-        members=tuple(subsystem.count for subsystem in common.subsystems),
+        members=tuple(peer_class.count for peer_class in common.subsystems),
         local=driven_index,
         to=other_index,
         unpaired=difference_loops[0] if difference_loops else None,
@@ -129,20 +135,27 @@ def responses(numeric: NumericModel, port: DevicePort, other: DevicePort) -> Res
     )
 
 
-def _gripped_device(numeric: NumericModel, group: PeerClass, part: str, unit_of: Mapping[str, str]) -> Device:
+def _gripped_device(
+    numeric: NumericModel, peer_class: PeerClass, part: str, unit_of: Mapping[str, str]
+) -> Device:
     """Return the device of a class of peers, the only one if no part is named.
 
     Without a device, an error E931 is raised.
     """
     direct = coupled_directly(numeric.model.peer_types)
     device = find_device(
-        group.jacobians, group.parameters, unit_of, group.initial_reception, part=part, direct=direct
+        peer_class.jacobians,
+        peer_class.parameters,
+        unit_of,
+        peer_class.initial_reception,
+        part=part,
+        direct=direct,
     )
     if isinstance(device, Device):
         return device
-    message = device or f"{group.name} has no device"
+    message = device or f"{peer_class.name} has no device"
     names = device_labels(numeric)
-    local = [name for name in names if name.startswith(f"{group.name}[")]
+    local = [name for name in names if name.startswith(f"{peer_class.name}[")]
     fix = f'--at "{(local or names)[0]}"' if names else "" if device else LOCAL_MASS
     raise ApcError(Diagnostic("E931", SourceLocation(numeric.model.origin.topology), message, fix=fix))
 
@@ -165,11 +178,11 @@ def device_labels(numeric: NumericModel) -> list[str]:
     ]
 
 
-def _check_increments(model: Model, group: PeerClass) -> None:
+def _check_increments(model: Model, peer_class: PeerClass) -> None:
     """Raise ApcError E933 for a peer with too many events and states in a frame."""
-    forced_increments = len(group.schedule.events) * len(group.subsystem.a)
+    forced_increments = len(peer_class.schedule.events) * len(peer_class.subsystem.a)
     if forced_increments > MOST_INCREMENTS:
-        message = f"a frame of {group.name} has {forced_increments:,} events and states"
+        message = f"a frame of {peer_class.name} has {forced_increments:,} events and states"
         advice = f"use at most {MOST_INCREMENTS:,} events and states"
         raise ApcError(Diagnostic("E933", SourceLocation(model.origin.topology), message, advice=advice))
 
@@ -177,7 +190,7 @@ def _check_increments(model: Model, group: PeerClass) -> None:
 def _are_by_class(loops: Sequence[ModalSystem]) -> bool:
     """Return whether loops are a common loop and a difference loop per class; a ring has other modes."""
     common, *difference_loops = loops
-    many = {subsystem.name: subsystem.count - 1 for subsystem in common.subsystems}
+    many = {peer_class.name: peer_class.count - 1 for peer_class in common.subsystems}
     return all(
         len(modal_system.subsystems) == 1
         and modal_system.multiplicity == many.get(modal_system.subsystems[0].name)
@@ -215,7 +228,7 @@ class Responses:
     @functools.cached_property
     def copies(self) -> list[tuple[str, int] | None]:
         """For each class, the name of the object whose position it sends, and the index of that state."""
-        return [_copy_of(subsystem.group, self.device) for subsystem in self.loops[0].subsystems]
+        return [_copy_of(subsystem.peer_class, self.device) for subsystem in self.loops[0].subsystems]
 
     @property
     def object(self) -> str:
@@ -336,14 +349,14 @@ class Responses:
         }
 
 
-def _copy_of(group: PeerClass, device: Device) -> tuple[str, int] | None:
+def _copy_of(peer_class: PeerClass, device: Device) -> tuple[str, int] | None:
     """Return the object copy whose position a peer sends, and the index of its state; None without a copy.
 
     If the position has several axes, the axis of the driven device is used.
     """
     _, axis = whole_and_index(device.part)
-    peer_type = group.jacobians.peer_type
-    for send, sending in zip(group.subsystem.sends, peer_type.sends, strict=True):
+    peer_type = peer_class.jacobians.peer_type
+    for send, sending in zip(peer_class.subsystem.sends, peer_type.sends, strict=True):
         for row, unit in zip(send.x, sending.units, strict=True):
             indices = np.flatnonzero(row)
             if unit == "m" and len(indices) == 1 and row[indices[0]] == 1:

@@ -2,7 +2,7 @@
 
 Takes: a `NumericModel` whose links lose or delay packets independently of each other.
 Gives: `class_moments`; `Classes`, `classes_of`, `moments_of`; `PerTickReception`, `build_reception`,
-`local_value`; `peer_classes`, `stored_of`, `neutral_motions`, `instants`; `PeerVersusRest`,
+`local_value`; `common_modal_system`, `stored_of`, `neutral_motions`, `instants`; `PeerVersusRest`,
 `MomentCoordinates`, `Moments`.
 Guarantees: on complete graphs the cost is independent of the number of equal peers. Exchangeable peers form
 one class on any graph.
@@ -81,7 +81,7 @@ class PerTickReception:
 
     def of(self, modal_system: ModalSystem) -> list[tuple[UncertainSample, ...]]:
         """Return the received sample of each row of r, for each subsystem of a loop."""
-        return [self.rows[subsystem.index] for subsystem in modal_system.subsystems]
+        return [self.rows[peer_class.index] for peer_class in modal_system.subsystems]
 
 
 def build_reception(
@@ -119,7 +119,10 @@ def build_reception(
         model, timings=tuple(replace(timing, value=timings[timing.name]) for timing in model.timings)
     )
     groups, comm_graph = lifted_classes(replace(numeric, model=shifted_system, given_schedules=by_tick))
-    rows = {group.index: schedules[comm_graph.group_of(group.peers.first)].selected for group in groups}
+    rows = {
+        peer_class.index: schedules[comm_graph.group_of(peer_class.peers.first)].selected
+        for peer_class in groups
+    }
     strictly = numeric.order.index("tick") < numeric.order.index("deliver")
     frame, quantum = schedules[0].frame_s, schedules[0].quantum
     return PerTickReception(groups, comm_graph, rows, timings, frame, quantum, strictly)
@@ -203,22 +206,22 @@ class Classes:
     @property
     def counts(self) -> list[int]:
         """The number of peers of each class."""
-        return [subsystem.count for subsystem in self.common.subsystems]
+        return [peer_class.count for peer_class in self.common.subsystems]
 
 
 def classes_of(reception: PerTickReception) -> Classes:
     """Return the classes of exchangeable peers of a model, with the loops and rigid motions of each."""
-    common, weights = peer_classes(reception)
+    common, weights = common_modal_system(reception)
     loops = []
     for class_index, peer_class in enumerate(common.subsystems):
         one_peer = PeerIndices((range(peer_class.peers.first, peer_class.peers.first + 1),))
         subsystems = [(class_index, replace(peer_class, count=1, peers=one_peer), 1)]
-        for g, subsystem in enumerate(common.subsystems):
+        for g, other in enumerate(common.subsystems):
             first = int(g == class_index)
-            if count := subsystem.count - first:
+            if count := other.count - first:
                 candidates = count if first else peer_class.count
-                others = subsystem.peers.others if first else subsystem.peers
-                subsystems.append((g, replace(subsystem, count=count, peers=others), candidates))
+                others = other.peers.others if first else other.peers
+                subsystems.append((g, replace(other, count=count, peers=others), candidates))
         coupling = {
             coupling_term: tuple(
                 tuple(
@@ -229,9 +232,7 @@ def classes_of(reception: PerTickReception) -> Classes:
             )
             for coupling_term, rows in weights.items()
         }
-        modal_system = ModalSystem(
-            peer_class.name, 1, tuple(subsystem for _, subsystem, _ in subsystems), coupling
-        )
+        modal_system = ModalSystem(peer_class.name, 1, tuple(member for _, member, _ in subsystems), coupling)
         class_data = tuple(g for g, *_ in subsystems), tuple(candidates for *_, candidates in subsystems)
         loops.append(PeerVersusRest(modal_system, *class_data, neutral_motions(modal_system)))
     return Classes(reception, common, weights, tuple(loops))
@@ -463,18 +464,18 @@ def _moment_classes(classes: Classes, memories: Sequence[RouteMemory]) -> list[_
 
 def neutral_motions(modal_system: ModalSystem) -> Floats:
     """Return the rigid modes of a loop over its subsystems' own states (n, d)."""
-    states = sum(len(subsystem.z_names) for subsystem in modal_system.subsystems)
+    states = sum(len(peer_class.z_names) for peer_class in modal_system.subsystems)
     return find_rigid_modes(without_packets(modal_system), with_drifts=False).basis[:states]
 
 
-def peer_classes(reception: PerTickReception) -> tuple[ModalSystem, Coupling]:
+def common_modal_system(reception: PerTickReception) -> tuple[ModalSystem, Coupling]:
     """Return the loop of all classes of peers, and the coupling weights between classes.
 
     Peers of a class are exchangeable: each receives from all peers of a class, its own included, with equal
     weight, or from none.
     """
     groups, comm_graph = reception.groups, reception.comm_graph
-    if not incomplete_links((group.schedule for group in groups), comm_graph):
+    if not incomplete_links((peer_class.schedule for peer_class in groups), comm_graph):
         degrees = complete_degrees(groups, comm_graph)
 
         def weight(coupling_term: CouplingTerm, g: int, h: int) -> Fraction:
@@ -484,9 +485,9 @@ def peer_classes(reception: PerTickReception) -> tuple[ModalSystem, Coupling]:
         return complete_loops(groups, comm_graph)[0], couple(groups, comm_graph, weight, degrees)
     dense = dense_loop(groups, comm_graph)
     common = split_exchangeable(dense, comm_graph)[0]
-    index = {group.peers.first: number for number, group in enumerate(dense.subsystems)}
-    first = [index[subsystem.peers.first] for subsystem in common.subsystems]
-    last = [index[subsystem.peers.last] for subsystem in common.subsystems]
+    index = {peer_class.peers.first: number for number, peer_class in enumerate(dense.subsystems)}
+    first = [index[peer_class.peers.first] for peer_class in common.subsystems]
+    last = [index[peer_class.peers.last] for peer_class in common.subsystems]
     weights = {
         coupling_term: tuple(
             tuple(rows[g][last[k] if g == h else h] for k, h in enumerate(first)) for g in first
@@ -519,8 +520,8 @@ def stored_of(
         `receiver_memory.memory_of`.
     """
     received: dict[Route, list[UncertainSample]] = {}
-    for subsystem, rows in zip(common.subsystems, reception.of(common), strict=True):
-        size = subsystem.lifted.mapped(lambda block: np.abs(value_of(block)) + error_radius(block))
+    for peer_class, rows in zip(common.subsystems, reception.of(common), strict=True):
+        size = peer_class.lifted.mapped(lambda block: np.abs(value_of(block)) + error_radius(block))
         is_used: Flags = np.any(size.q, axis=0) | np.any(size.d, axis=0)
         for index, row in enumerate(rows):
             if is_used[index] and not row.gap:

@@ -63,7 +63,7 @@ class Forced:
 
     def of(self, subsystems: Sequence[PeerClass]) -> list[tuple[int, PeerReadings]]:
         """Return the number of peers of each class, and the class's readings."""
-        return [(subsystem.count, self.peers[subsystem.index]) for subsystem in subsystems]
+        return [(peer_class.count, self.peers[peer_class.index]) for peer_class in subsystems]
 
     def peer_by_peer(self) -> list[tuple[int, PeerReadings]]:
         """Return the readings of each peer, in the order of peers."""
@@ -97,13 +97,13 @@ def forced(model: Model, reception: PerTickReception, first: Fraction = Fraction
     ticks = instants(reception, fastest)
     groups: list[PeerClass] = []
     peers: dict[int, PeerReadings] = {}
-    for group in reception.groups:
+    for peer_class in reception.groups:
         device = find_device(
-            group.jacobians, group.parameters, unit_of, group.initial_reception, direct=direct
+            peer_class.jacobians, peer_class.parameters, unit_of, peer_class.initial_reception, direct=direct
         )
         if isinstance(device, str):
             raise NotSupportedError(device)
-        forced_group, peers[group.index] = _forced(group, device, ticks, -first % reception.frame)
+        forced_group, peers[peer_class.index] = _forced(peer_class, device, ticks, -first % reception.frame)
         groups.append(forced_group)
     if not any(peer.input_slots for peer in peers.values()):
         raise NotSupportedError("no peer has a device besides its object copies")
@@ -111,14 +111,14 @@ def forced(model: Model, reception: PerTickReception, first: Fraction = Fraction
 
 
 def _forced(
-    group: PeerClass, device: Device | None, ticks: Sequence[Fraction], start: Fraction
+    peer_class: PeerClass, device: Device | None, ticks: Sequence[Fraction], start: Fraction
 ) -> tuple[PeerClass, PeerReadings]:
     """Return a group with a force input at its device, new values at each frame, and readings of its copies'
     positions.
 
     Parameters
     ----------
-    group
+    peer_class
         The peers.
     device
         The hand-held device, None without one.
@@ -127,7 +127,7 @@ def _forced(
     start
         The instant of the positions, in seconds within a frame.
     """
-    peer_type, schedule = group.jacobians.peer_type, group.schedule
+    peer_type, schedule = peer_class.jacobians.peer_type, peer_class.schedule
     copies = [
         (sending.link, name)
         for sending in peer_type.sends
@@ -135,7 +135,7 @@ def _forced(
         if unit == "m"
     ]
     subsystems, readings = [], []
-    for subsystem in (group.subsystem, group.exact):
+    for subsystem in (peer_class.subsystem, peer_class.exact):
         force_column = np.zeros((len(subsystem.a), 1), dtype=subsystem.a.dtype)
         if device is not None:
             force_column[device.velocity] += (
@@ -153,7 +153,7 @@ def _forced(
         input_slots=range(input_slots[0], input_slots[-1] + 1) if input_slots else range(0),
         copies=dict(zip(copies, ports.read[0].tolist(), strict=True)),
     )
-    return group.with_subsystem(subsystem, exact, extended_schedule), peer
+    return peer_class.with_subsystem(subsystem, exact, extended_schedule), peer
 
 
 def _positions(subsystem: LinearSubsystem, peer_type: PeerType) -> Matrix:
@@ -192,8 +192,8 @@ def moments_error(peer_moments: Moments, classes: Sequence[tuple[int, PeerReadin
     variances = dict[tuple[Copy, int], float]()
     for block_coordinates, moment in zip(peer_moments.moving, moments, strict=True):
         subsystems = [
-            (subsystem.count, classes[g][1])
-            for subsystem, g in zip(
+            (peer_class.count, classes[g][1])
+            for peer_class, g in zip(
                 block_coordinates.loop.modal_system.subsystems, block_coordinates.loop.class_of, strict=True
             )
         ]

@@ -177,20 +177,23 @@ class MeanSubsystem:
 
 
 def with_memory(
-    group: PeerClass, memory: Sequence[RouteMemory], frame: FrameMap | None = None
+    peer_class: PeerClass, memory: Sequence[RouteMemory], frame: FrameMap | None = None
 ) -> MeanSubsystem:
     """Return a subsystem whose state includes the mean of its receivers' memory.
 
     Parameters
     ----------
-    group
+    peer_class
         The subsystem.
     memory
         The memory of each route.
     frame
         The frame map of the subsystem, if different from the group's (for example over a cell).
     """
-    frame_map, row_of = frame or group.lifted, {sent: row for row, sent in enumerate(group.schedule.sent)}
+    frame_map, row_of = (
+        frame or peer_class.lifted,
+        {sent: row for row, sent in enumerate(peer_class.schedule.sent)},
+    )
     numbers = [
         (item, channel)
         for item in memory
@@ -280,8 +283,8 @@ def mean_loop(
     """
     memory_by_route = {item.route: item for item in memory}
     subsystems = [
-        with_memory(group, memory, frames[group.name] if frames else None)
-        for group in modal_system.subsystems
+        with_memory(peer_class, memory, frames[peer_class.name] if frames else None)
+        for peer_class in modal_system.subsystems
     ]
     offsets = np.cumsum([0] + [subsystem.states for subsystem in subsystems]).tolist()
     starts = np.cumsum([0] + [subsystem.map.s.shape[-2] for subsystem in subsystems]).tolist()
@@ -388,7 +391,7 @@ def with_stored_values(
     ApcError
         E806 no fractions satisfy the equation within its error bounds, as entries overflow.
     """
-    sizes = [len(group.z_names) for group in modal_system.subsystems]
+    sizes = [len(peer_class.z_names) for peer_class in modal_system.subsystems]
     state_indices = np.concatenate(
         [offset + np.arange(size) for offset, size in zip(offsets, sizes, strict=False)]
     )

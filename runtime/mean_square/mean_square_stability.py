@@ -27,7 +27,7 @@ from apc.mean_square.class_moments import (
     PerTickReception,
     build_reception,
     class_moments,
-    peer_classes,
+    common_modal_system,
 )
 from apc.mean_square.copy_error import forced, moments_error
 from apc.mean_square.loss_results import ConsecutiveLosses, TopLyapunovExponent
@@ -211,7 +211,7 @@ def independent_growth(
     def errors() -> tuple[float, str]:
         """Return the copy error in m, and a note."""
         pushed = forced(model, reception, arrival)
-        classes = pushed.of(peer_classes(pushed.reception)[0].subsystems)
+        classes = pushed.of(common_modal_system(pushed.reception)[0].subsystems)
         return moments_error(moments(model, pushed.reception), classes), ""
 
     of = moments(model, reception)

@@ -56,12 +56,15 @@ def unprovable(system: ClosedLoop | ModalSystem) -> str:
     """Return the reason why a system has no exact coefficients, "" if its coefficients are exact."""
     if not system.subsystems:
         return "its matrix was not composed from those of peers"
-    for group in {group.index: group for group in system.subsystems}.values():
-        functions = [group.jacobians.function, *(edge.function for edge in group.jacobians.edges.values())]
+    for peer_class in {peer_class.index: peer_class for peer_class in system.subsystems}.values():
+        functions = [
+            peer_class.jacobians.function,
+            *(edge.function for edge in peer_class.jacobians.edges.values()),
+        ]
         if not all(function.is_a("SXFunction") for function in functions):
-            return f"the equations of {group.name} contain a nonlinear loop, whose solution is rounded"
+            return f"the equations of {peer_class.name} contain a nonlinear loop, whose solution is rounded"
         if not all(is_rational(function) for function in functions):
-            return f"the equations of {group.name} contain functions whose values are rounded"
+            return f"the equations of {peer_class.name} contain functions whose values are rounded"
     return ""
 
 
@@ -80,10 +83,10 @@ def subsystem_balls(system: ClosedLoop | ModalSystem) -> list[LinearSubsystem]:
     """
     converted: dict[int, LinearSubsystem] = {}
     linear_subsystems = []
-    for group in system.subsystems:
-        if group.index not in converted:
-            converted[group.index] = entrywise(group.exact, rational_ball)
-        linear_subsystems.append(converted[group.index])
+    for peer_class in system.subsystems:
+        if peer_class.index not in converted:
+            converted[peer_class.index] = entrywise(peer_class.exact, rational_ball)
+        linear_subsystems.append(converted[peer_class.index])
     return linear_subsystems
 
 
@@ -105,10 +108,10 @@ def frame_balls(system: ClosedLoop | ModalSystem) -> Balls:
     subsystems = subsystem_balls(system)
     computed: dict[int, Steps] = {}
     steps = []
-    for subsystem, group in zip(subsystems, system.subsystems, strict=True):
-        if group.index not in computed:
-            computed[group.index] = frame_steps(subsystem, group.schedule)
-        steps.append(computed[group.index])
+    for subsystem, peer_class in zip(subsystems, system.subsystems, strict=True):
+        if peer_class.index not in computed:
+            computed[peer_class.index] = frame_steps(subsystem, peer_class.schedule)
+        steps.append(computed[peer_class.index])
     return closed_frame(system, subsystems, steps)
 
 
@@ -145,7 +148,9 @@ def closed_frame(
     n = len(layout.names)
     start = np.eye(n, dtype=np.int64).astype(object) if state is None else state
     index_of = layout.indices
-    rows_of = [{sent: row for row, sent in enumerate(group.schedule.sent)} for group in system.subsystems]
+    rows_of = [
+        {sent: row for row, sent in enumerate(peer_class.schedule.sent)} for peer_class in system.subsystems
+    ]
     weights = weight_balls(system) if weights is None else weights
     sent: dict[tuple[int, int], Balls] = {}
 
@@ -171,11 +176,17 @@ def closed_frame(
     matrix = np.zeros(start.shape, dtype=object)
     mode_paths = {
         g: follow(
-            *(subsystem, group.schedule, step, start[offset : offset + len(group.z_names)], receiving(g)),
+            *(
+                subsystem,
+                peer_class.schedule,
+                step,
+                start[offset : offset + len(peer_class.z_names)],
+                receiving(g),
+            ),
             numbers=BALLS,
             watch=watch and functools.partial(watch, g),
         )
-        for g, (group, subsystem, step, offset) in enumerate(
+        for g, (peer_class, subsystem, step, offset) in enumerate(
             zip(system.subsystems, subsystems, steps, layout.offsets, strict=True)
         )
     }

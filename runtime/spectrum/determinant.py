@@ -164,24 +164,24 @@ def loop_characteristic(
     """
     n_s = n_r = 0
     members = []
-    for group in groups:
-        schedule, maps = group.schedule, group.lifted.mapped(lambda block: block[None])
+    for peer_class in groups:
+        schedule, maps = peer_class.schedule, peer_class.lifted.mapped(lambda block: block[None])
         rows, lines = np.arange(n_s, n_s + len(schedule.sent)), np.arange(n_r, n_r + len(schedule.received))
         n_s, n_r = n_s + len(rows), n_r + len(lines)
         subsystems, unit = TransferSubsystems(maps, np.ones(1), rows, lines), np.ones(len(lines))
         members.append(
             TransferMember(
-                *(group.name, schedule, group.z_names, subsystems, 0 * unit, unit, unit),
-                subsystem=partial(_subsystem_of, group),
+                *(peer_class.name, schedule, peer_class.z_names, subsystems, 0 * unit, unit, unit),
+                subsystem=partial(_subsystem_of, peer_class),
             )
         )
     transfer = transfer_of([member.subsystems for member in members], n_s, n_r)
     return characteristic_of(transfer, *_feedback_weights(groups, coupling, weight_errors)), tuple(members)
 
 
-def _subsystem_of(group: PeerClass, _: int) -> LinearSubsystem:
+def _subsystem_of(peer_class: PeerClass, _: int) -> LinearSubsystem:
     """Return the subsystem of a class of peers; its index is not used."""
-    return group.subsystem
+    return peer_class.subsystem
 
 
 def _feedback_weights(
@@ -202,12 +202,12 @@ def _feedback_weights(
     -------
     The lags l, the weights W_l (l, n_r, n_s), and their error bounds.
     """
-    sent_starts = np.cumsum([0, *(len(group.schedule.sent) for group in subsystems)])
-    reception_starts = np.cumsum([0, *(len(group.schedule.received) for group in subsystems)])
-    lags = sorted({received.lag for group in subsystems for received in group.schedule.received})
+    sent_starts = np.cumsum([0, *(len(peer_class.schedule.sent) for peer_class in subsystems)])
+    reception_starts = np.cumsum([0, *(len(peer_class.schedule.received) for peer_class in subsystems)])
+    lags = sorted({received.lag for peer_class in subsystems for received in peer_class.schedule.received})
     weights = np.zeros((2, len(lags), int(reception_starts[-1]), int(sent_starts[-1])))
-    for g, group in enumerate(subsystems):
-        for input_row, received in enumerate(group.schedule.received):
+    for g, peer_class in enumerate(subsystems):
+        for input_row, received in enumerate(peer_class.schedule.received):
             for h, sender in enumerate(subsystems):
                 if received.sent in sender.schedule.sent:
                     row = sent_starts[h] + sender.schedule.sent.index(received.sent)

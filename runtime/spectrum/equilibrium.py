@@ -37,11 +37,11 @@ def equilibrium_residual(groups: Sequence[PeerClass]) -> str:
     groups
         All peers of the topology; a group that is linear on its side of a kink is left out.
     """
-    linearized_groups = [group for group in groups if group.initial_reception is not None]
+    linearized_groups = [peer_class for peer_class in groups if peer_class.initial_reception is not None]
     quantities = [
         quantity
-        for group in linearized_groups
-        for quantity in _unbalanced_quantities(group, named=len(groups) > 1)
+        for peer_class in linearized_groups
+        for quantity in _unbalanced_quantities(peer_class, named=len(groups) > 1)
     ]
     for unit in FORCES:
         candidates = [
@@ -56,20 +56,20 @@ def equilibrium_residual(groups: Sequence[PeerClass]) -> str:
     return ""
 
 
-def _unbalanced_quantities(group: PeerClass, *, named: bool) -> list[tuple[float, str, str]]:
+def _unbalanced_quantities(peer_class: PeerClass, *, named: bool) -> list[tuple[float, str, str]]:
     """Return the unbalanced quantities of a class at the start: magnitude, unit, and part or state.
 
     A quantity is a force on a part: the output of a hold that changes the state at the same rate. Without
     such a hold it is the rate of the state. `named` states that names begin with that of the group.
     """
-    assert group.initial_reception is not None, "linearized where it starts"
+    assert peer_class.initial_reception is not None, "linearized where it starts"
     peer_type, subsystem, p = (
-        group.jacobians.peer_type,
-        group.subsystem,
-        [float(value) for value in group.parameters],
+        peer_class.jacobians.peer_type,
+        peer_class.subsystem,
+        [float(value) for value in peer_class.parameters],
     )
-    x, u, m = start_values(group.jacobians, p)
-    received = iter([float(value) for value in group.initial_reception.values])
+    x, u, m = start_values(peer_class.jacobians, p)
+    received = iter([float(value) for value in peer_class.initial_reception.values])
     hold_outputs, hold_sizes = np.zeros(len(u)), np.zeros(len(u))  # outputs of holds, and their terms
     units = [""] * len(u)
     for clock, slopes, memories in zip(peer_type.clocks, subsystem.ticks, m, strict=True):
@@ -87,7 +87,7 @@ def _unbalanced_quantities(group: PeerClass, *, named: bool) -> list[tuple[float
     rates = _column(peer_type.derivative(x, hold_outputs, p, 0.0))
     term_sizes = np.abs(_column(peer_type.derivative(x, u, p, 0.0))) + np.abs(subsystem.b) @ hold_sizes
     term_sizes += np.abs(subsystem.a) @ np.abs(np.array(x, dtype=np.float64))
-    prefix = f"{group.name}." if named else ""
+    prefix = f"{peer_class.name}." if named else ""
     result = []
     for index in np.flatnonzero(np.abs(rates) > ROUNDED * term_sizes).tolist():
         name, rate = prefix + peer_type.states[index].name, abs(float(rates[index]))

@@ -63,7 +63,7 @@ class GraphScale:
 
 
 def graph_scale(
-    group: PeerClass, coupling_terms: Sequence[CouplingTerm], comm_graph: CommunicationGraph
+    peer_class: PeerClass, coupling_terms: Sequence[CouplingTerm], comm_graph: CommunicationGraph
 ) -> GraphScale:
     """Return the weights of equal peers for their neighbours on the graph common to all coupling terms.
 
@@ -83,7 +83,7 @@ def graph_scale(
     degree = _degree(link, comm_graph)
     return GraphScale(
         {
-            coupling_term: group.gain(coupling_term, group)
+            coupling_term: peer_class.gain(coupling_term, peer_class)
             / (degree if degree and coupling_term.operator == "mean" else Fraction(1))
             for coupling_term in coupling_terms
         },
@@ -91,7 +91,7 @@ def graph_scale(
     )
 
 
-def graph_loop(group: PeerClass, mode: GraphMode, scale: GraphScale) -> ModalSystem:
+def graph_loop(peer_class: PeerClass, mode: GraphMode, scale: GraphScale) -> ModalSystem:
     """Return the loop of an eigenvalue of W: one subsystem with a real weight, or two for a complex pair."""
     a, b = mode.real, mode.imaginary
     weights = scale.weights
@@ -110,10 +110,10 @@ def graph_loop(group: PeerClass, mode: GraphMode, scale: GraphScale) -> ModalSys
                 coupling_term: replace(surd, scale=weight * surd.scale)
                 for coupling_term, weight in weights.items()
             }
-        return ModalSystem(name, mode.multiplicity, (group,), coupling, weight_errors, surds)
+        return ModalSystem(name, mode.multiplicity, (peer_class,), coupling, weight_errors, surds)
     pair = {
         coupling_term: ((weight * a, -weight * b), (weight * b, weight * a))
         for coupling_term, weight in weights.items()
     }
-    subsystems = tuple(replace(group, name=part) for part in ("real", "imaginary"))
+    subsystems = tuple(replace(peer_class, name=part) for part in ("real", "imaginary"))
     return ModalSystem(f"{name} ± {mode.value.imag:.6g}i", mode.multiplicity, subsystems, pair, weight_errors)

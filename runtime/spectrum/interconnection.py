@@ -62,8 +62,8 @@ class ModalSystem:
         """The packets in transit, in order of state."""
         return tuple(
             DelayedSample(h, row, lag)
-            for h, group in enumerate(self.subsystems)
-            for row, depth in enumerate(group.schedule.depths)
+            for h, peer_class in enumerate(self.subsystems)
+            for row, depth in enumerate(peer_class.schedule.depths)
             for lag in range(1, depth + 1)
         )
 
@@ -80,7 +80,7 @@ class ModalSystem:
     @property
     def states(self) -> int:
         """The number of states."""
-        return sum(states_of(group.schedule, group.jacobians) for group in self.subsystems)
+        return sum(states_of(peer_class.schedule, peer_class.jacobians) for peer_class in self.subsystems)
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,8 +109,10 @@ class StateLayout:
 def without_packets(modal_system: ModalSystem) -> ModalSystem:
     """Return the loop without packets in its state: the number of rigid modes is independent of delays."""
     subsystems = tuple(
-        replace(group, schedule=replace(group.schedule, depths=(0,) * len(group.schedule.depths)))
-        for group in modal_system.subsystems
+        replace(
+            peer_class, schedule=replace(peer_class.schedule, depths=(0,) * len(peer_class.schedule.depths))
+        )
+        for peer_class in modal_system.subsystems
     )
     return replace(modal_system, subsystems=subsystems)
 
@@ -137,11 +139,13 @@ def lay_out(z_names: Sequence[Sequence[str]], schedules: Sequence[Schedule]) -> 
 def lay_out_loop(loop: ModalSystem | ClosedLoop) -> StateLayout:
     """Return the layout of a loop's state; for several subsystems each name includes its peer."""
     groups = loop.subsystems
-    layout = lay_out([group.z_names for group in groups], [group.schedule for group in groups])
+    layout = lay_out(
+        [peer_class.z_names for peer_class in groups], [peer_class.schedule for peer_class in groups]
+    )
     if len(groups) == 1:
         return layout
     sizes = np.diff([*layout.offsets, len(layout.names)])
-    owners = (group.name for group, size in zip(groups, sizes, strict=True) for _ in range(size))
+    owners = (peer_class.name for peer_class, size in zip(groups, sizes, strict=True) for _ in range(size))
     return replace(
         layout, names=tuple(f"{owner}.{name}" for owner, name in zip(owners, layout.names, strict=True))
     )
@@ -188,7 +192,7 @@ class ClosedLoop:
 
 def close_loop(loop: ModalSystem | ClosedLoop) -> ClosedLoop:
     """Return the closed loop of K subsystems: r_g = Σ_h W_gh s_h, each packet with its age at arrival."""
-    maps = [group.lifted for group in loop.subsystems]
+    maps = [peer_class.lifted for peer_class in loop.subsystems]
     layout = lay_out_loop(loop)
     closed = interconnect(maps, feedback_of(loop, layout), layout, numbers=MIDPOINT_RADIUS)
     return ClosedLoop(
@@ -203,8 +207,8 @@ def close_loop(loop: ModalSystem | ClosedLoop) -> ClosedLoop:
         received=tuple(map(value_of, closed.received)),
         motion=tuple(
             offset + index
-            for group, offset in zip(loop.subsystems, layout.offsets, strict=True)
-            for index in range(len(group.subsystem.peer_type.states))
+            for peer_class, offset in zip(loop.subsystems, layout.offsets, strict=True)
+            for index in range(len(peer_class.subsystem.peer_type.states))
         ),
         weight_errors=loop.weight_errors,
         surds=loop.surds,
@@ -248,16 +252,18 @@ def bounded_weight(weight: Fraction, weight_error: float) -> tuple[float, float]
 
 def feedback_of(loop: ModalSystem | ClosedLoop, layout: StateLayout) -> list[InterconnectionMatrices]:
     """Return the interconnection matrices, each weight with the radius of its error and rounding."""
-    row_of = [{sent: row for row, sent in enumerate(group.schedule.sent)} for group in loop.subsystems]
-    starts = np.cumsum([0] + [len(group.schedule.sent) for group in loop.subsystems]).tolist()
+    row_of = [
+        {sent: row for row, sent in enumerate(peer_class.schedule.sent)} for peer_class in loop.subsystems
+    ]
+    starts = np.cumsum([0] + [len(peer_class.schedule.sent) for peer_class in loop.subsystems]).tolist()
     # Few weights at many indices: each is converted once, and plain keys are found faster than packets.
     indices = {(packet.subsystem, packet.row, packet.lag): index for packet, index in layout.indices.items()}
     converted: dict[tuple[int, int, float], tuple[float, float]] = {}
     feedbacks = []
-    for g, group in enumerate(loop.subsystems):
-        direct = np.zeros((2, len(group.schedule.received), starts[-1]))
-        delayed = np.zeros((2, len(group.schedule.received), len(layout.names)))
-        for input_row, received in enumerate(group.schedule.received):
+    for g, peer_class in enumerate(loop.subsystems):
+        direct = np.zeros((2, len(peer_class.schedule.received), starts[-1]))
+        delayed = np.zeros((2, len(peer_class.schedule.received), len(layout.names)))
+        for input_row, received in enumerate(peer_class.schedule.received):
             weight_error = loop.weight_errors.get(received.coupling_term, 0.0)
             columns, weights = [], []
             for h, weight in enumerate(loop.coupling[received.coupling_term][g]):

@@ -90,8 +90,8 @@ def decompose(groups: Sequence[PeerClass], comm_graph: CommunicationGraph) -> Mo
     groups, comm_graph
         As for `split`.
     """
-    coupling_terms = used_coupling_terms(group.schedule for group in groups)
-    graphs = incomplete_links((group.schedule for group in groups), comm_graph)
+    coupling_terms = used_coupling_terms(peer_class.schedule for peer_class in groups)
+    graphs = incomplete_links((peer_class.schedule for peer_class in groups), comm_graph)
     if not graphs:
         return ModalDecomposition("modes", complete_loops(groups, comm_graph), ())
     named = " and ".join(f"{link} ({comm_graph.links[link].graph.shape})" for link in graphs)
@@ -137,7 +137,9 @@ def accepted_loops(
     decomposed = decompose(groups, comm_graph)
     if decomposed.method == "modes" and accepted(decomposed.loops):
         return decomposed.loops, True
-    states = sum(group.count * states_of(group.schedule, group.jacobians) for group in groups)
+    states = sum(
+        peer_class.count * states_of(peer_class.schedule, peer_class.jacobians) for peer_class in groups
+    )
     if states > MATRIX_STATES:
         message = f"{subject}: {comm_graph.peers:,} peers on this graph form one system of {states:,} states"
         advice = f"use equal peers on complete graphs, or at most {MATRIX_STATES:,} states in total"
@@ -162,10 +164,10 @@ def orthogonal_loops(
     NotSupportedError
         More peers on such a graph than the limit.
     """
-    graphs = incomplete_links((group.schedule for group in groups), comm_graph)
+    graphs = incomplete_links((peer_class.schedule for peer_class in groups), comm_graph)
     if not graphs:
         return complete_loops(groups, comm_graph)
-    count = sum(group.count for group in groups)
+    count = sum(peer_class.count for peer_class in groups)
     if count > most:
         raise NotSupportedError(f"{count:,} peers on a graph that is not complete; the limit is {most}")
     if len(groups) == 1 and all(comm_graph.links[link].graph.shape == "ring" for link in graphs):
@@ -193,17 +195,17 @@ def complete_loops(groups: Sequence[PeerClass], comm_graph: CommunicationGraph) 
         degrees,
     )
     loops = [ModalSystem(_mode_family(groups), 1, tuple(groups), weights)]
-    if all(group.count < 2 for group in groups):
+    if all(peer_class.count < 2 for peer_class in groups):
         return tuple(loops)
     separation = couple(
         groups, comm_graph, lambda coupling_term, g, h: Fraction(-1 if g == h else 0), degrees
     )
-    for index, group in enumerate(groups):
-        if group.count < 2:
+    for index, peer_class in enumerate(groups):
+        if peer_class.count < 2:
             continue
         own_weights = {key: ((rows[index][index],),) for key, rows in separation.items()}
-        name = "difference" if len(groups) == 1 else f"difference {group.name}"
-        loops.append(ModalSystem(name, group.count - 1, (group,), own_weights))
+        name = "difference" if len(groups) == 1 else f"difference {peer_class.name}"
+        loops.append(ModalSystem(name, peer_class.count - 1, (peer_class,), own_weights))
     return tuple(loops)
 
 
@@ -228,7 +230,9 @@ def dense(groups: Sequence[PeerClass], comm_graph: CommunicationGraph) -> Closed
 
 def refuse_dense(groups: Sequence[PeerClass], comm_graph: CommunicationGraph) -> None:
     """Raise ApcError E804 for a dense system with too many states, before any peer is evaluated."""
-    states = sum(group.count * states_of(group.schedule, group.jacobians) for group in groups)
+    states = sum(
+        peer_class.count * states_of(peer_class.schedule, peer_class.jacobians) for peer_class in groups
+    )
     if states > MATRIX_STATES:
         raise too_large(comm_graph, f"{comm_graph.peers:,} peers", states)
 
@@ -236,9 +240,12 @@ def refuse_dense(groups: Sequence[PeerClass], comm_graph: CommunicationGraph) ->
 def dense_loop(groups: Sequence[PeerClass], comm_graph: CommunicationGraph) -> ModalSystem:
     """Return all peers of the system as one loop, one subsystem per peer."""
     all_peers = tuple(
-        replace(group, name=comm_graph.peer_name(peer), count=1, peers=PeerIndices((range(peer, peer + 1),)))
-        for peer, group in sorted(
-            ((peer, group) for group in groups for peer in group.peers), key=lambda pair: pair[0]
+        replace(
+            peer_class, name=comm_graph.peer_name(peer), count=1, peers=PeerIndices((range(peer, peer + 1),))
+        )
+        for peer, peer_class in sorted(
+            ((peer, peer_class) for peer_class in groups for peer in peer_class.peers),
+            key=lambda pair: pair[0],
         )
     )
     weights = {
@@ -306,7 +313,7 @@ def split_exchangeable(modal_system: ModalSystem, comm_graph: CommunicationGraph
         for coupling_term in modal_system.coupling
     }
     loops = [replace(modal_system, name=_mode_family(subsystems), subsystems=subsystems, coupling=coupling)]
-    for subsystem, members in zip(subsystems, classes, strict=True):
+    for peer_class, members in zip(subsystems, classes, strict=True):
         if len(members) > 1:
             first, second = members[:2]
             separation = {
@@ -314,14 +321,16 @@ def split_exchangeable(modal_system: ModalSystem, comm_graph: CommunicationGraph
                 for coupling_term, rows in modal_system.coupling.items()
             }
             multiplicity = modal_system.multiplicity * (len(members) - 1)
-            loops.append(ModalSystem(f"difference {subsystem.name}", multiplicity, (subsystem,), separation))
+            loops.append(
+                ModalSystem(f"difference {peer_class.name}", multiplicity, (peer_class,), separation)
+            )
     return tuple(loops)
 
 
 def _are_exchangeable(modal_system: ModalSystem, g: int, h: int) -> bool:
     """Return whether an exchange of the subsystems g and h leaves the loop unchanged."""
-    subsystem, other = modal_system.subsystems[g], modal_system.subsystems[h]
-    if subsystem.index != other.index:
+    peer_class, other = modal_system.subsystems[g], modal_system.subsystems[h]
+    if peer_class.index != other.index:
         return False
     remaining = [index for index in range(len(modal_system.subsystems)) if index not in (g, h)]
     return all(
@@ -346,7 +355,7 @@ def _class_weight(
 
 def _merged_class(subsystems: Sequence[PeerClass], comm_graph: CommunicationGraph) -> PeerClass:
     """Return equal subsystems as one class of peers."""
-    peers = PeerIndices(tuple(run for subsystem in subsystems for run in subsystem.peers.runs))
+    peers = PeerIndices(tuple(run for peer_class in subsystems for run in peer_class.peers.runs))
     return replace(subsystems[0], name=group_name(peers, comm_graph), count=len(peers), peers=peers)
 
 
@@ -370,15 +379,17 @@ def couple(
         The divisors of a mean, by link and subsystem, without entries for peers that receive nothing.
     """
     coupling = {}
-    for coupling_term in used_coupling_terms(group.schedule for group in groups):
+    for coupling_term in used_coupling_terms(peer_class.schedule for peer_class in groups):
         rows = []
-        for g, group in enumerate(groups):
-            receives = any(received.coupling_term == coupling_term for received in group.schedule.received)
+        for g, peer_class in enumerate(groups):
+            receives = any(
+                received.coupling_term == coupling_term for received in peer_class.schedule.received
+            )
             if receives and coupling_term.operator == "mean":
                 total = degrees.get((coupling_term.link, g))
                 check_mean(
                     comm_graph,
-                    group.peers.first,
+                    peer_class.peers.first,
                     coupling_term.link,
                     "mean",
                     total is not None,
@@ -393,14 +404,16 @@ def couple(
                 )
                 if (
                     weight
-                    and comm_graph.delay(coupling_term.link, sender.delay_class, group.delay_class)
+                    and comm_graph.delay(coupling_term.link, sender.delay_class, peer_class.delay_class)
                     == coupling_term.delay
                 ):
                     if coupling_term.operator == "mean":
                         weight /= degrees[coupling_term.link, g]
                     elif coupling_term.operator in ("max", "min"):  # the one that is split off counts once
                         weight = Fraction(1 if weight > 0 else -1)
-                    row.append(weight * group.gain(coupling_term, sender) if coupling_term.edge else weight)
+                    row.append(
+                        weight * peer_class.gain(coupling_term, sender) if coupling_term.edge else weight
+                    )
                 else:
                     row.append(Fraction(0))
             rows.append(tuple(row))
@@ -414,9 +427,9 @@ def complete_degrees(
     """Return the number of other peers from which a peer of each group receives, for each complete link."""
     degrees = {}
     for link in comm_graph.links:
-        total = sum(group.count for group in groups if group.sends(link))
-        for g, group in enumerate(groups):
-            number = total - (1 if group.sends(link) else 0)
+        total = sum(peer_class.count for peer_class in groups if peer_class.sends(link))
+        for g, peer_class in enumerate(groups):
+            number = total - (1 if peer_class.sends(link) else 0)
             if number:
                 degrees[link, g] = Fraction(number)
     return degrees

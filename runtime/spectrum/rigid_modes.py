@@ -183,9 +183,9 @@ def _shifted_names(names: Sequence[str], vector: Sequence[Fraction]) -> str:
 def _indices(subsystems: Sequence[PeerClass], units: Sequence[str]) -> list[int]:
     """Return the indices of continuous states with one of the given units."""
     indices, start = [], 0
-    sizes = [states_of(group.schedule, group.jacobians) for group in subsystems]
-    for group, size in zip(subsystems, sizes, strict=True):
-        states = group.jacobians.peer_type.states
+    sizes = [states_of(peer_class.schedule, peer_class.jacobians) for peer_class in subsystems]
+    for peer_class, size in zip(subsystems, sizes, strict=True):
+        states = peer_class.jacobians.peer_type.states
         indices += [start + index for index, state in enumerate(states) if state.unit in units]
         start += size
     return indices
@@ -224,7 +224,9 @@ def _neutral_solutions(system: ClosedLoop | ModalSystem) -> list[tuple[list[Frac
 
     An output that is not used may be free without being part of the state.
     """
-    equations, states = _constant_solution_equations(system, [group.exact for group in system.subsystems])
+    equations, states = _constant_solution_equations(
+        system, [peer_class.exact for peer_class in system.subsystems]
+    )
     pairs: list[tuple[list[Fraction], list[Fraction]]] = []
     for solution in null_space(equations):
         state = _sparse_product(states, solution)
@@ -283,7 +285,7 @@ def _constant_solution_equations(
             }
     equations, states = [np.zeros((0, size), dtype=object)], [np.zeros((0, size), dtype=object)]
     unit = np.eye(size, dtype=np.int64).astype(object)
-    for g, (group, subsystem, output, (x, u)) in enumerate(
+    for g, (peer_class, subsystem, output, (x, u)) in enumerate(
         zip(system.subsystems, subsystems, outputs, indices, strict=True)
     ):
         equations.append(_over_unknowns(size, len(x), (x, subsystem.a), (u, subsystem.b)))
@@ -299,7 +301,7 @@ def _constant_solution_equations(
                     if not (isinstance(gain, Rational) and gain == 0)
                 ]
                 received: dict[int, Any] = {}  # the combined value, by unknown
-                for coupling_term, channel in group.schedule.coupling_terms(p, index):
+                for coupling_term, channel in peer_class.schedule.coupling_terms(p, index):
                     for h, weight in enumerate(system.coupling[coupling_term][g]):
                         if weight:
                             for column, entry in sent[h].get((coupling_term.link, channel), ()):
@@ -314,11 +316,13 @@ def _constant_solution_equations(
             for row in range(len(rows)):  # of all variants
                 rows[row, y[row % len(y)]] -= 1
             equations.append(rows)
-        discrete_states = [output[value.partition][value.output] for value in group.schedule.discrete_states]
+        discrete_states = [
+            output[value.partition][value.output] for value in peer_class.schedule.discrete_states
+        ]
         states.append(unit[[*x, *discrete_states]])
         for packet in system.packets:
             if packet.subsystem == g:
-                sent_sample = group.schedule.sent[packet.row]
+                sent_sample = peer_class.schedule.sent[packet.row]
                 state = np.zeros((1, size), dtype=object)
                 for column, entry in sent[g][sent_sample.link, sent_sample.channel]:
                     state[0, column] = entry
@@ -402,7 +406,7 @@ def _ramp_equations(
     """
     states = np.array([[number(entry) for entry in state] for state in neutral], dtype=object).T
     rates, z = BALLS.multiply(states, unknowns[: len(neutral)]), unknowns[len(neutral) :]
-    subsystems = [entrywise(group.exact, number) for group in system.subsystems]
+    subsystems = [entrywise(peer_class.exact, number) for peer_class in system.subsystems]
     rates_of = [
         rates[offset : offset + len(subsystem.a)]
         for subsystem, offset in zip(subsystems, system.layout.offsets, strict=True)
@@ -423,8 +427,8 @@ def _ramp_equations(
         for coupling_term, rows in system.coupling.items()
     }
     steps = [
-        frame_steps(subsystem, group.schedule, euler)
-        for subsystem, group in zip(subsystems, system.subsystems, strict=True)
+        frame_steps(subsystem, peer_class.schedule, euler)
+        for subsystem, peer_class in zip(subsystems, system.subsystems, strict=True)
     ]
     end_state = closed_frame(system, subsystems, steps, weights=weights, state=z, watch=watch)
     equations.append(end_state - z - rates * number(system.subsystems[0].schedule.frame_s))

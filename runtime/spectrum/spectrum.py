@@ -272,7 +272,9 @@ def _largest_component(closed_loop: ClosedLoop) -> int:
 
 def _exact_work(closed_loop: ClosedLoop) -> int:
     """Return the number of states times the number of events of a frame."""
-    return len(closed_loop.matrix) * sum(len(group.schedule.events) for group in closed_loop.subsystems)
+    return len(closed_loop.matrix) * sum(
+        len(peer_class.schedule.events) for peer_class in closed_loop.subsystems
+    )
 
 
 def _is_undecided(solved: _SolvedLoop, lowest: float) -> bool:
@@ -433,8 +435,8 @@ def _has_discrete_updates(closed_loop: ClosedLoop) -> bool:
     """Return whether any discrete update, besides the exact exponential, forms the frame's map."""
     return not closed_loop.subsystems or any(
         not isinstance(event, Propagate)
-        for group in closed_loop.subsystems
-        for event in group.schedule.events
+        for peer_class in closed_loop.subsystems
+        for event in peer_class.schedule.events
     )
 
 
@@ -523,17 +525,17 @@ def angles_in_frame(closed_loop: ClosedLoop, values: Complexes, vectors: Complex
     if not closed_loop.subsystems:
         return np.where(moving, np.nan, angles)
     subsystem_of = np.searchsorted(closed_loop.offsets, dominant, side="right") - 1
-    for g, (group, offset, received) in enumerate(
+    for g, (peer_class, offset, received) in enumerate(
         zip(closed_loop.subsystems, closed_loop.offsets, closed_loop.received, strict=True)
     ):
         mode_indices = np.flatnonzero(moving & (subsystem_of == g))
         if len(mode_indices):
-            start = vectors[offset : offset + len(group.z_names), mode_indices].T
+            start = vectors[offset : offset + len(peer_class.z_names), mode_indices].T
             input_rows = (received @ vectors[:, mode_indices]).T
-            subsystem = every_matrix(group.subsystem, lambda matrix: matrix[None])
+            subsystem = every_matrix(peer_class.subsystem, lambda matrix: matrix[None])
             angles[mode_indices] = phase_advance(
                 subsystem,
-                group.schedule,
+                peer_class.schedule,
                 start,
                 input_rows,
                 dominant[mode_indices] - offset,

@@ -51,7 +51,7 @@ def count_translations(numeric: NumericModel, populations: Sequence[Heterogeneou
     for modal_system in complete_loops(groups, numeric.comm_graph):
         free = len(find_rigid_modes(modal_system, with_drifts=False).names)
         if free and not are_common_to_all_peers(
-            modal_system, [populations[group.index] for group in modal_system.subsystems]
+            modal_system, [populations[peer_class.index] for peer_class in modal_system.subsystems]
         ):
             return None
         total += modal_system.multiplicity * free
@@ -71,7 +71,9 @@ def are_common_to_all_peers(modal_system: ModalSystem, populations: Sequence[Het
     for index, population in enumerate(populations):
         if not (population.parameters != population.parameters[0]).any():
             continue  # every represented peer equals its representative
-        subsystems: list[LinearSubsystem | None] = [group.exact for group in modal_system.subsystems]
+        subsystems: list[LinearSubsystem | None] = [
+            peer_class.exact for peer_class in modal_system.subsystems
+        ]
         subsystems[index] = _random_peer(population)
         linear_subsystems = [subsystem for subsystem in subsystems if subsystem is not None]
         if len(linear_subsystems) < len(subsystems) or not stays_rigid(modal_system, linear_subsystems):

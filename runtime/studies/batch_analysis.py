@@ -535,11 +535,11 @@ def _parameter_vectors(
         key=lambda column: varied[column].free.group or "",
     )
 
-    def vectors(group: PeerClass) -> Floats:
+    def vectors(peer_class: PeerClass) -> Floats:
         """Return the parameters of a class at the points (k, n_p), or (1, n_p) if they are constant."""
-        index, peer = shared.evaluator.first_peer(group)
-        names, group_name = group.jacobians.peer_type.parameters, shared.model.groups[index].name
-        vectors = group.parameters[None]
+        index, peer = shared.evaluator.first_peer(peer_class)
+        names, group_name = peer_class.jacobians.peer_type.parameters, shared.model.groups[index].name
+        vectors = peer_class.parameters[None]
 
         def set_columns(changed_columns: list[int], values: Floats) -> None:
             """Set some columns of the parameters."""
@@ -550,7 +550,9 @@ def _parameter_vectors(
 
         for reached, resolved, index_of in dependent_values:
             rows = [
-                group.parameters if numbers is None else numbers.parameters[index][numbers.rows[index][peer]]
+                peer_class.parameters
+                if numbers is None
+                else numbers.parameters[index][numbers.rows[index][peer]]
                 for numbers in resolved
             ]
             changed_columns = [column for column, name in enumerate(names) if name in reached]

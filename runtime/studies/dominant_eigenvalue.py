@@ -235,15 +235,15 @@ def _angles(
     largest_state = motion[participations[:, motion].argmax(axis=1)]
     moves = participations[np.arange(count), largest_state] > LEAST_SHARE * participations.sum(axis=1)
     subsystem_of = np.searchsorted(closed_loop.offsets, largest_state, side="right") - 1
-    for g, (group, offset) in enumerate(zip(closed_loop.subsystems, closed_loop.offsets, strict=True)):
+    for g, (peer_class, offset) in enumerate(zip(closed_loop.subsystems, closed_loop.offsets, strict=True)):
         indices = np.flatnonzero(moves & (subsystem_of == g))
         if not len(indices):
             continue
         system_at_points = bounded.at(indices)
-        start = vectors[indices, offset : offset + len(group.z_names)]
+        start = vectors[indices, offset : offset + len(peer_class.z_names)]
         received = (system_at_points.received[g] @ vectors[indices, :, None])[:, :, 0]
         states = largest_state[indices] - offset
         result[indices] = phase_advance(
-            system_at_points.subsystems[g], group.schedule, start, received, states, values[indices]
+            system_at_points.subsystems[g], peer_class.schedule, start, received, states, values[indices]
         )
     return result

@@ -177,19 +177,19 @@ class BatchEvaluator:
             for stepped in matrices
         )
 
-    def vectors(self, group: PeerClass, values: Matrices) -> Matrices:
+    def vectors(self, peer_class: PeerClass, values: Matrices) -> Matrices:
         """Return the parameter vectors (k, n_p) of a class, or (1, n_p) if they are constant."""
         if not self.tangents:
-            return group.parameters[None]
-        index, peer = self.first_peer(group)
+            return peer_class.parameters[None]
+        index, peer = self.first_peer(peer_class)
         values_of = {parameter_ref: values[:, column] for column, parameter_ref in enumerate(self.free)}
         return free_rows(self.model, self.model.groups[index], peer, values_of)
 
-    def first_peer(self, group: PeerClass) -> tuple[int, int]:
+    def first_peer(self, peer_class: PeerClass) -> tuple[int, int]:
         """Return the index of the model's group of the first peer of a class, and the peer's index in
         the group.
         """
-        first = group.peers.first
+        first = peer_class.peers.first
         index = self.comm_graph.group_of(first)
         return index, first - int(self.comm_graph.starts[index])
 
@@ -203,18 +203,18 @@ class BatchEvaluator:
 
         If the parameter is a time, only step durations change.
         """
-        used = {group.index for closed_loop in systems for group in closed_loop.subsystems}
+        used = {peer_class.index for closed_loop in systems for peer_class in closed_loop.subsystems}
         at_value = {
-            group.index: (vector, linearize_exact(group.jacobians, group.exact_at(vector)))
-            for group, vector in self._parameters_at(value)
-            if group.index in used
+            peer_class.index: (vector, linearize_exact(peer_class.jacobians, peer_class.exact_at(vector)))
+            for peer_class, vector in self._parameters_at(value)
+            if peer_class.index in used
         }
 
-        def at_point(group: PeerClass) -> PeerClass:
+        def at_point(peer_class: PeerClass) -> PeerClass:
             """Return a class with the parameters and the exact subsystem of the point."""
-            vector, exact = at_value[group.index]
-            numbers = tuple(group.exact_at(vector))
-            return replace(group, parameters=vector, exact_parameters=numbers, exact=exact)
+            vector, exact = at_value[peer_class.index]
+            numbers = tuple(peer_class.exact_at(vector))
+            return replace(peer_class, parameters=vector, exact_parameters=numbers, exact=exact)
 
         return tuple(
             replace(closed_loop, subsystems=tuple(map(at_point, closed_loop.subsystems)))
@@ -224,14 +224,14 @@ class BatchEvaluator:
     def _parameters_at(self, value: Sequence[float]) -> list[tuple[PeerClass, Floats]]:
         """Return each class with its parameters at one point (m,)."""
         point = np.array([value], dtype=np.float64)
-        return [(group, self.vectors(group, point)[0]) for group in self.groups]
+        return [(peer_class, self.vectors(peer_class, point)[0]) for peer_class in self.groups]
 
     def lifted(self, values: Matrices) -> dict[int, FrameMap]:
         """Return the frame maps of all classes by their indices."""
         result: dict[int, FrameMap] = {}
-        for group in self.groups:
-            if group.index not in result:
-                result[group.index] = self._lift(group, values)
+        for peer_class in self.groups:
+            if peer_class.index not in result:
+                result[peer_class.index] = self._lift(peer_class, values)
         return result
 
     def bounded(self, vectors: Callable[[PeerClass], Floats]) -> tuple[Bounded, ...]:
@@ -244,13 +244,15 @@ class BatchEvaluator:
         """
         assert not self.timed, "the errors of a step belong to its time"
         lifts: dict[int, tuple[LinearSubsystem, FrameMap]] = {}
-        for group in self.groups:
-            if group.index not in lifts:
-                lifts[group.index] = self._lift_bounded(group, vectors(group))
+        for peer_class in self.groups:
+            if peer_class.index not in lifts:
+                lifts[peer_class.index] = self._lift_bounded(peer_class, vectors(peer_class))
         bounded_systems = []
         for wiring in self.wirings:
             closed_loop = wiring.closed_loop
-            subsystems, maps = zip(*(lifts[group.index] for group in closed_loop.subsystems), strict=True)
+            subsystems, maps = zip(
+                *(lifts[peer_class.index] for peer_class in closed_loop.subsystems), strict=True
+            )
             closed = interconnect(maps, wiring.feedback, closed_loop.layout, numbers=MIDPOINT_RADIUS)
             complete = value_of(closed.matrix)
             coordinates, is_valid = relative_at(wiring, complete)
@@ -264,45 +266,47 @@ class BatchEvaluator:
             )
         return tuple(bounded_systems)
 
-    def _lift_bounded(self, group: PeerClass, vectors: Floats) -> tuple[LinearSubsystem, FrameMap]:
+    def _lift_bounded(self, peer_class: PeerClass, vectors: Floats) -> tuple[LinearSubsystem, FrameMap]:
         """Return the subsystems of a class at all points, and their frame maps with error radii."""
-        rows = linearize_rows(group.jacobians, vectors)
-        subsystem, steps, invalid = self._with_exponentials(group, subsystem_of(group.jacobians, rows))
+        rows = linearize_rows(peer_class.jacobians, vectors)
+        subsystem, steps, invalid = self._with_exponentials(
+            peer_class, subsystem_of(peer_class.jacobians, rows)
+        )
         bounded = with_roundings(subsystem)
         steps = steps or self.steps(bounded, np.zeros((1, 1)), MIDPOINT_RADIUS)
         with np.errstate(all="ignore"):
-            frame = compose(bounded, group.schedule, steps, numbers=MIDPOINT_RADIUS)
+            frame = compose(bounded, peer_class.schedule, steps, numbers=MIDPOINT_RADIUS)
         _set_invalid(frame, invalid)
         return subsystem, frame
 
-    def _lift(self, group: PeerClass, values: Matrices) -> FrameMap:
+    def _lift(self, peer_class: PeerClass, values: Matrices) -> FrameMap:
         """Return the frame map of a class, each matrix with a leading axis of points; NaN at invalid
         points.
         """
         if self.tangents:
-            rows = self.rows(group.jacobians, self.vectors(group, values))
-            linear_subsystem = subsystem_of(group.jacobians, rows)
+            rows = self.rows(peer_class.jacobians, self.vectors(peer_class, values))
+            linear_subsystem = subsystem_of(peer_class.jacobians, rows)
         else:
-            linear_subsystem = every_matrix(group.subsystem, lambda block: np.array(block[None]))
-        subsystem, exponentials, invalid = self._with_exponentials(group, linear_subsystem)
+            linear_subsystem = every_matrix(peer_class.subsystem, lambda block: np.array(block[None]))
+        subsystem, exponentials, invalid = self._with_exponentials(peer_class, linear_subsystem)
         transitions = {quanta: value_of(step) for quanta, step in exponentials.items()}
         transitions = transitions or self.steps(subsystem, values, FLOATS)
         with np.errstate(all="ignore"):
-            frame = compose(subsystem, group.schedule, transitions)
+            frame = compose(subsystem, peer_class.schedule, transitions)
         _set_invalid(frame, invalid)
         return frame
 
     def _with_exponentials(
-        self, group: PeerClass, subsystem: LinearSubsystem
+        self, peer_class: PeerClass, subsystem: LinearSubsystem
     ) -> tuple[LinearSubsystem, Mapping[int, Matrices], NDArray[np.bool_]]:
         """Return a class's subsystems, their exponentials if constant, and the mask of points without
         exponentials.
         """
         radius_excess = is_too_large(subsystem.a, subsystem.b)
-        if group.index in self.fixed:
+        if peer_class.index in self.fixed:
             return (
                 replace(subsystem, a=subsystem.a[:1], b=subsystem.b[:1]),
-                self.fixed[group.index],
+                self.fixed[peer_class.index],
                 radius_excess,
             )
         subsystem.a[radius_excess], subsystem.b[radius_excess] = (
@@ -371,13 +375,15 @@ def batch_evaluator(
     systems = split(groups, comm_graph) if matrices else ()
     if durations is None:
         durations = {
-            event.duration: (float(event.duration * group.schedule.quantum), 0.0)
-            for group in groups
-            for event in group.schedule.events
+            event.duration: (float(event.duration * peer_class.schedule.quantum), 0.0)
+            for peer_class in groups
+            for event in peer_class.schedule.events
             if isinstance(event, Propagate)
         }
     tangents = (
-        {group.jacobians.peer_type.name: _tangent(group.jacobians) for group in groups} if follows else {}
+        {peer_class.jacobians.peer_type.name: _tangent(peer_class.jacobians) for peer_class in groups}
+        if follows
+        else {}
     )
     evaluator = BatchEvaluator(
         model=model,
@@ -426,14 +432,14 @@ def _constant_exponentials(evaluator: BatchEvaluator) -> dict[int, Mapping[int, 
         return {}
     result: dict[int, Mapping[int, Matrices]] = {}
     point, along = _generic_point(len(evaluator.free))
-    for group in evaluator.groups:
-        if group.index in result:
+    for peer_class in evaluator.groups:
+        if peer_class.index in result:
             continue
-        vectors = evaluator.vectors(group, point + (STEP * 1j) * along)
-        subsystem = subsystem_of(group.jacobians, evaluator.rows(group.jacobians, vectors))
+        vectors = evaluator.vectors(peer_class, point + (STEP * 1j) * along)
+        subsystem = subsystem_of(peer_class.jacobians, evaluator.rows(peer_class.jacobians, vectors))
         if not (np.iscomplexobj(subsystem.a) and (subsystem.a.imag.any() or subsystem.b.imag.any())):
             real = with_roundings(every_matrix(subsystem, np.real))
-            result[group.index] = evaluator.steps(real, point, MIDPOINT_RADIUS)
+            result[peer_class.index] = evaluator.steps(real, point, MIDPOINT_RADIUS)
     return result
 
 
@@ -441,14 +447,14 @@ def lifted_systems(systems: Sequence[Wired]) -> tuple[Wired, ...]:
     """Return systems with their subsystems linearized and lifted at their parameters, each subsystem once."""
     cached: dict[int, tuple[LinearSubsystem, FrameMap]] = {}
 
-    def lifted(group: PeerClass) -> PeerClass:
+    def lifted(peer_class: PeerClass) -> PeerClass:
         """Return a class with its subsystem and frame map at its parameters."""
-        key, built = group.index, group.jacobians
+        key, built = peer_class.index, peer_class.jacobians
         if key not in cached:
-            subsystem = linearize(built, group.parameters)
-            cached[key] = subsystem, lift(subsystem, group.schedule, exact=group.exact)
+            subsystem = linearize(built, peer_class.parameters)
+            cached[key] = subsystem, lift(subsystem, peer_class.schedule, exact=peer_class.exact)
         subsystem, frame = cached[key]
-        return replace(group, subsystem=subsystem).with_lifted(frame)
+        return replace(peer_class, subsystem=subsystem).with_lifted(frame)
 
     return tuple(
         replace(closed_loop, subsystems=tuple(map(lifted, closed_loop.subsystems))) for closed_loop in systems

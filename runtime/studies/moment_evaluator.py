@@ -111,7 +111,7 @@ class MomentEvaluator(RadiusEvaluator):
         """Return the second-moment operator at each value (k, m), over a cell along a given direction."""
         assert self.lifts is not None and self.classes is not None
         lifted = self.lifts.lifted(values if along is None else values + (STEP * 1j) * along)
-        names = {subsystem.name: subsystem.index for subsystem in self.classes.common.subsystems}
+        names = {peer_class.name: peer_class.index for peer_class in self.classes.common.subsystems}
 
         def at_point(block: NDArray[np.complex128], k: int) -> Floats:
             """Return a matrix at one point with its error radius, and its derivative (2 or 3, n, n)."""

@@ -164,7 +164,7 @@ class MatrixPath(SingleSegment):
         valid, pairs = dominant_at(
             self.evaluator,
             *self._parts,
-            lambda group: np.array([model.vector(group.peers.first) for model in models]),
+            lambda peer_class: np.array([model.vector(peer_class.peers.first) for model in models]),
             np.ones(len(values), dtype=np.bool_),
         )
         for row in np.flatnonzero(pairs.certain).tolist():

@@ -160,11 +160,11 @@ def test_what_is_remembered_and_held_is_a_state_where_it_is_read(
     ticks: list[str], delay: str, names: list[str], expected: list[list[float]]
 ) -> None:
     variables = ", f: {unit: 1, start: 0}" + (", s: {unit: 1, start: 0}" if len(ticks) > 1 else "")
-    [group], _ = lifted_classes(
+    [peer_class], _ = lifted_classes(
         numeric_model(alone("hold(f, delay) - x", *ticks, variables=variables, delay=delay))
     )
-    assert list(group.z_names) == names
-    np.testing.assert_allclose(group.lifted.p[0], expected, rtol=1e-14)
+    assert list(peer_class.z_names) == names
+    np.testing.assert_allclose(peer_class.lifted.p[0], expected, rtol=1e-14)
 
 
 def test_clocks_that_hardly_ever_stand_as_before_are_refused_with_their_periods() -> None:

@@ -182,12 +182,12 @@ def _modes(numeric: NumericModel) -> tuple[list[LossMode], float]:
     for modal_system in loops:
         received_loop = packets.loop(modal_system, packet_numbers, depths)
         error_bound = []
-        for g, subsystem in enumerate(received_loop.subsystems):
+        for g, peer_class in enumerate(received_loop.subsystems):
             reception_of = dict[
                 tuple[CouplingTerm, SentSample], dict[int, int]
             ]()  # all receivers of a packet have the same error
             for link in sorted(lossy):
-                for input_row, received in used_rows(subsystem, link):
+                for input_row, received in used_rows(peer_class, link):
                     reception_of.setdefault((received.coupling_term, received.sent), {})[input_row] = (
                         received.lag
                     )
@@ -197,7 +197,7 @@ def _modes(numeric: NumericModel) -> tuple[list[LossMode], float]:
         response = change_of_sent(received_loop, error_bound, ratios, sizes)
         lost_loop = packets.loop(modal_system, previous_packets, depths)
         layout = lay_out_loop(lost_loop)
-        maps, n = [subsystem.lifted for subsystem in lost_loop.subsystems], len(layout.names)
+        maps, n = [peer_class.lifted for peer_class in lost_loop.subsystems], len(layout.names)
         states = len(response.coordinates.eliminated) + len(response.coordinates.rest)
         matrix = np.zeros((2, states, states))
         matrix[:, :n, :n] = interconnect(

@@ -136,7 +136,7 @@ def hold_frame(model: Model, reception: PerTickReception, *, interchangeable: bo
                 received_channels.append(ReceivedChannel(g, memory.route, weights))
                 loss_channels.append((g, h, number))
                 laws.append(channel_law(model, links[memory.route[0]], memory.route[1]))
-    no_neutral_modes = np.zeros((sum(len(subsystem.z_names) for subsystem in modal_system.subsystems), 0))
+    no_neutral_modes = np.zeros((sum(len(peer_class.z_names) for peer_class in modal_system.subsystems), 0))
     means = mean_loop(modal_system, reception.of(modal_system), memories, received_channels, no_neutral_modes)
     matrix, first = value_of(means.matrix), means.offsets[-1]
     noise = [index for channel in means.channels for index in channel.noise]

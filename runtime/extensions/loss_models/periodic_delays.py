@@ -141,7 +141,7 @@ class Packets:
     ) -> ModalSystem:
         """Return a loop whose ticks receive the packets of the given numbers."""
         subsystems = []
-        for subsystem, rows in zip(modal_system.subsystems, self.reception.of(modal_system), strict=True):
+        for peer_class, rows in zip(modal_system.subsystems, self.reception.of(modal_system), strict=True):
             received = []
             for row in rows:
                 frames, slot = divmod(numbers[row], self.slots[row.coupling_term.link])
@@ -150,10 +150,10 @@ class Packets:
                         row.coupling_term, SentSample(row.coupling_term.link, row.channel, slot), -frames
                     )
                 )
-            stored = tuple(depths[sent.link] for sent in subsystem.schedule.sent)
+            stored = tuple(depths[sent.link] for sent in peer_class.schedule.sent)
             subsystems.append(
                 replace(
-                    subsystem, schedule=replace(subsystem.schedule, received=tuple(received), depths=stored)
+                    peer_class, schedule=replace(peer_class.schedule, received=tuple(received), depths=stored)
                 )
             )
         return replace(modal_system, subsystems=tuple(subsystems))
@@ -185,9 +185,9 @@ def trace_radius(numeric: NumericModel) -> TraceGrowth:
     result = []
     for modal_system in decompose(packets.reception.groups, packets.reception.comm_graph).loops:
         stored = sum(
-            depths[sent.link] for subsystem in modal_system.subsystems for sent in subsystem.schedule.sent
+            depths[sent.link] for peer_class in modal_system.subsystems for sent in peer_class.schedule.sent
         )
-        if stored + sum(len(subsystem.z_names) for subsystem in modal_system.subsystems) > MATRIX_STATES:
+        if stored + sum(len(peer_class.z_names) for peer_class in modal_system.subsystems) > MATRIX_STATES:
             raise NotSupportedError("the recorded delays exceed the supported length")
         result.append(_period_growth(modal_system, packets, received, depths, frames))
     low, high, radius, uncertainty = np.array(result).max(axis=0).tolist()
@@ -229,7 +229,7 @@ def _period_growth(
         if numbers not in frame_maps:
             frame_loop = packets.loop(modal_system, dict(zip(rows, numbers, strict=True)), depths)
             layout = lay_out_loop(frame_loop)
-            maps = [subsystem.lifted for subsystem in frame_loop.subsystems]
+            maps = [peer_class.lifted for peer_class in frame_loop.subsystems]
             matrix = interconnect(
                 maps, feedback_of(frame_loop, layout), layout, numbers=MIDPOINT_RADIUS
             ).matrix

@@ -174,8 +174,8 @@ def receivers_of(
     (memory,) = stored
     link = next(link for link in model.links if link.name == memory.route[0])
     law = channel_law(model, link, memory.route[1])
-    counts = [subsystem.count for subsystem in common.subsystems]
-    subsystems = [with_memory(group, stored) for group in common.subsystems]
+    counts = [peer_class.count for peer_class in common.subsystems]
+    subsystems = [with_memory(peer_class, stored) for peer_class in common.subsystems]
     received_now = sorted(set(memory.memory.received.values()))
     values = []
     for subsystem in subsystems:
@@ -290,11 +290,11 @@ def _mean_matrix(
     """Return the state matrix (2, n, n) of the means of a loop's subsystems."""
     spans, matrix = list(map(slice, starts, starts[1:])), np.zeros((2, starts[-1], starts[-1]))
     for index, g in enumerate(peer_versus_rest.class_of):
-        for sender, (h, subsystem) in enumerate(
+        for sender, (h, peer_class) in enumerate(
             zip(peer_versus_rest.class_of, peer_versus_rest.modal_system.subsystems, strict=True)
         ):
             block = entrywise(
-                receivers[g].shares[h], rounded_number(float(subsystem.count - (sender == index)))
+                receivers[g].shares[h], rounded_number(float(peer_class.count - (sender == index)))
             )
             matrix[:, spans[index], spans[sender]] = (
                 MIDPOINT_RADIUS.add(receivers[g].mean, block) if sender == index else block
@@ -331,8 +331,8 @@ def _deviations(
     received_of_first_class, senders_of_first_class = (
         receiver.received[:, first_class],
         sum(
-            subsystem.count
-            for subsystem, g in zip(
+            peer_class.count
+            for peer_class, g in zip(
                 peer_versus_rest.modal_system.subsystems, peer_versus_rest.class_of, strict=True
             )
             if g == first_class

@@ -80,11 +80,11 @@ class Response:
         return proves_gain(self.a, self.b, self.c, self.d, gain)
 
 
-def used_rows(subsystem: PeerClass, link: str) -> list[tuple[int, ReceivedSample]]:
+def used_rows(peer_class: PeerClass, link: str) -> list[tuple[int, ReceivedSample]]:
     """Return the rows of r of a subsystem that receive over a link and affect an output."""
-    q, d = value_of(subsystem.lifted.q), value_of(subsystem.lifted.d)
+    q, d = value_of(peer_class.lifted.q), value_of(peer_class.lifted.d)
     is_used = np.any(q, axis=0) | np.any(d, axis=0)
-    rows = enumerate(subsystem.schedule.received)
+    rows = enumerate(peer_class.schedule.received)
     return [
         (line, received) for line, received in rows if received.coupling_term.link == link and is_used[line]
     ]
@@ -140,12 +140,15 @@ def change_of_sent(
                 before[:, packet_row, at] = share, 8 * UNIT_ROUNDOFF * share
         feedback.append(InterconnectionMatrices(receives.direct, before))
     closed = interconnect(
-        [subsystem.lifted for subsystem in modal_system.subsystems], feedback, layout, numbers=MIDPOINT_RADIUS
+        [peer_class.lifted for peer_class in modal_system.subsystems],
+        feedback,
+        layout,
+        numbers=MIDPOINT_RADIUS,
     )
     senders = [
         (h, row, sent)
-        for h, subsystem in enumerate(modal_system.subsystems)
-        for row, sent in enumerate(subsystem.schedule.sent)
+        for h, peer_class in enumerate(modal_system.subsystems)
+        for row, sent in enumerate(peer_class.schedule.sent)
     ]
     indices = {(packet.subsystem, packet.row, packet.lag): index for packet, index in layout.indices.items()}
     before, combined = np.zeros_like(closed.sent), dict[tuple[int, str, str], Matrix]()
@@ -184,13 +187,13 @@ def ratios_of(subsystems: Sequence[PeerClass], lossy: frozenset[str]) -> Ratios:
     result: dict[tuple[str, str], Fraction] = {}
     for link in sorted(lossy):
         columns: dict[str, dict[tuple[int, int, int, CouplingTerm], Fraction]] = {}
-        for g, subsystem in enumerate(subsystems):
+        for g, peer_class in enumerate(subsystems):
             used_channels = {
-                (received.coupling_term, received.sent.channel) for _, received in used_rows(subsystem, link)
+                (received.coupling_term, received.sent.channel) for _, received in used_rows(peer_class, link)
             }
-            for partition, tick in enumerate(subsystem.exact.ticks):
+            for partition, tick in enumerate(peer_class.exact.ticks):
                 for receive in range(tick.r.shape[1]):
-                    for coupling_term, channel in subsystem.schedule.coupling_terms(partition, receive):
+                    for coupling_term, channel in peer_class.schedule.coupling_terms(partition, receive):
                         if (coupling_term, channel) not in used_channels:
                             continue
                         channel_column = columns.setdefault(channel, {})
@@ -233,11 +236,11 @@ def weight_of(loops: Sequence[ModalSystem], lossy: frozenset[str]) -> tuple[floa
         used_terms = {
             received.coupling_term
             for modal_system in loops
-            for subsystem in modal_system.subsystems
-            for _, received in used_rows(subsystem, link)
+            for peer_class in modal_system.subsystems
+            for _, received in used_rows(peer_class, link)
         }
         for modal_system in loops if len(loops[0].subsystems) == 1 else loops[:1]:
-            count = np.array([subsystem.count for subsystem in modal_system.subsystems], np.float64)
+            count = np.array([peer_class.count for peer_class in modal_system.subsystems], np.float64)
             blocks = [
                 (np.abs(np.array(rows, np.float64)) + modal_system.weight_errors.get(coupling_term, 0.0))
                 * np.sqrt(count[:, None] / count)
@@ -248,8 +251,8 @@ def weight_of(loops: Sequence[ModalSystem], lossy: frozenset[str]) -> tuple[floa
                 continue
             units = _units(np.sum(blocks, axis=0))
             sizes |= {
-                (link, subsystem.name): unit
-                for subsystem, unit in zip(modal_system.subsystems, units.tolist(), strict=True)
+                (link, peer_class.name): unit
+                for peer_class, unit in zip(modal_system.subsystems, units.tolist(), strict=True)
             }
             scaled = np.concatenate([units[:, None] * block / units for block in blocks])
             largest = max(largest, float(np.linalg.norm(scaled, 2)))

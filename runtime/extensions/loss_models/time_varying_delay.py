@@ -109,8 +109,8 @@ def _loop_gain(numeric: NumericModel, delay: ParameterRef, low: Fraction, high: 
         rows = reception.of(modal_system)
         error_bound = [
             (g, {line: 0}, spread[rows[g][line]])
-            for g, subsystem in enumerate(nominal_loop.subsystems)
-            for line, _ in used_rows(subsystem, link.name)
+            for g, peer_class in enumerate(nominal_loop.subsystems)
+            for line, _ in used_rows(peer_class, link.name)
             if spread.get(rows[g][line])
         ]
         response = change_of_sent(nominal_loop, error_bound, ratios, sizes)

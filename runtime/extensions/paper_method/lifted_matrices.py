@@ -261,7 +261,10 @@ def _open_loop(model: Model, closed_loop: ClosedLoop) -> _OpenLoopMatrices:
     period, frame = _periods(model, subsystems)
     ratio = int(frame / period)
     timings = {timing.name: timing.value for timing in model.timings}
-    starts = [0, *itertools.accumulate(len(group.jacobians.peer_type.states) for group in subsystems)]
+    starts = [
+        0,
+        *itertools.accumulate(len(peer_class.jacobians.peer_type.states) for peer_class in subsystems),
+    ]
     n = starts[-1]
     if (n + 2 * len(subsystems)) * ratio > MOST_ROWS:
         message = (
@@ -272,43 +275,45 @@ def _open_loop(model: Model, closed_loop: ClosedLoop) -> _OpenLoopMatrices:
     sent = [
         {
             (sending.link, channel): row
-            for sending, send in zip(group.jacobians.peer_type.sends, group.exact.sends, strict=True)
+            for sending, send in zip(
+                peer_class.jacobians.peer_type.sends, peer_class.exact.sends, strict=True
+            )
             for channel, row in zip(sending.channels, send.x, strict=True)
         }
-        for group in subsystems
+        for peer_class in subsystems
     ]
     received: dict[tuple[int, CouplingTerm, str], _Signal] = {}
-    for i, group in enumerate(subsystems):
-        several_delays = len({received.coupling_term.delay for received in group.schedule.received}) > 1
+    for i, peer_class in enumerate(subsystems):
+        several_delays = len({received.coupling_term.delay for received in peer_class.schedule.received}) > 1
         indices = (
             (p, k)
-            for p, clock in enumerate(group.jacobians.peer_type.clocks)
+            for p, clock in enumerate(peer_class.jacobians.peer_type.clocks)
             for k in range(len(clock.receives))
         )
         for coupling_term, channel in (
-            pair for index in indices for pair in group.schedule.coupling_terms(*index)
+            pair for index in indices for pair in peer_class.schedule.coupling_terms(*index)
         ):
             row = np.full(n, Fraction(0), dtype=object)
             for j, weight in enumerate(closed_loop.coupling[coupling_term][i]):
                 row[starts[j] : starts[j + 1]] += weight * sent[j].get((coupling_term.link, channel), 0)
             delay = int(timings[coupling_term.delay] / frame)
             delay_text = f" {delay} frames late" if several_delays else ""
-            name = f"{group.name}.{coupling_term.operator}(others.{channel}){delay_text}"
+            name = f"{peer_class.name}.{coupling_term.operator}(others.{channel}){delay_text}"
             received[i, coupling_term, channel] = _Signal(name, delay, row)
     index_of = {key: index for index, key in enumerate(received)}
     fast: list[_Signal] = []
     slow: list[_Signal] = []
     columns: tuple[list[int], list[int]] = [], []  # indices of holds, over all subsystems
     first = 0
-    for i, group in enumerate(subsystems):
-        peer_type, own_states = group.jacobians.peer_type, slice(starts[i], starts[i + 1])
+    for i, peer_class in enumerate(subsystems):
+        peer_type, own_states = peer_class.jacobians.peer_type, slice(starts[i], starts[i + 1])
         clocks = [partition.clock for partition in peer_type.clocks]
         for column, hold in enumerate(peer_type.holds, first):
-            if group.schedule.active_at_start[column - first] is None:
+            if peer_class.schedule.active_at_start[column - first] is None:
                 continue
-            p, name = clocks.index(hold.clock), f"{group.name}.{hold.name}"
+            p, name = clocks.index(hold.clock), f"{peer_class.name}.{hold.name}"
             delay = int(timings[hold.delay] / period)
-            pattern, tick = group.jacobians.pattern.ticks[p], group.exact.ticks[p]
+            pattern, tick = peer_class.jacobians.pattern.ticks[p], peer_class.exact.ticks[p]
             input_rows = pattern.r[hold.output].any()
             if pattern.x[hold.output].any() or not input_rows:
                 row = np.full(n, Fraction(0), dtype=object)
@@ -318,7 +323,7 @@ def _open_loop(model: Model, closed_loop: ClosedLoop) -> _OpenLoopMatrices:
             if input_rows:
                 row = np.full(len(received), Fraction(0), dtype=object)
                 for k, weight in enumerate(tick.r[hold.output]):
-                    row[[index_of[i, *pair] for pair in group.schedule.coupling_terms(p, k)]] += weight
+                    row[[index_of[i, *pair] for pair in peer_class.schedule.coupling_terms(p, k)]] += weight
                 slow.append(_Signal(f"{name} received", delay, row))
                 columns[1].append(column)
         first += len(peer_type.holds)
@@ -333,21 +338,23 @@ def _open_loop(model: Model, closed_loop: ClosedLoop) -> _OpenLoopMatrices:
         return np.hstack([a, b[:, columns[0]], b[:, columns[1]]])
 
     steps_of_class = {
-        subsystem.index: discretize(subsystem.exact.a, subsystem.exact.b, [period])[0]
-        for subsystem in subsystems
+        peer_class.index: discretize(peer_class.exact.a, peer_class.exact.b, [period])[0]
+        for peer_class in subsystems
     }
-    steps = [steps_of_class[subsystem.index] for subsystem in subsystems]
+    steps = [steps_of_class[peer_class.index] for peer_class in subsystems]
     return _OpenLoopMatrices(
         ratio=ratio,
         period=period,
         states=tuple(
-            f"{group.name}.{state.name}" for group in subsystems for state in group.jacobians.peer_type.states
+            f"{peer_class.name}.{state.name}"
+            for peer_class in subsystems
+            for state in peer_class.jacobians.peer_type.states
         ),
         fast=tuple(fast),
         slow=tuple(slow),
         received=tuple(received.values()),
         ab=side_by_side(
-            np.hstack([subsystem.subsystem.a, subsystem.subsystem.b]) for subsystem in subsystems
+            np.hstack([peer_class.subsystem.a, peer_class.subsystem.b]) for peer_class in subsystems
         ),
         step=with_error_radius(
             side_by_side(value_of(step) for step in steps),
@@ -561,19 +568,21 @@ def _periods(model: Model, subsystems: Sequence[PeerClass]) -> tuple[Fraction, F
     link_clock = {link.name: link.clock for link in model.links}
     holds = [
         hold
-        for group in subsystems
+        for peer_class in subsystems
         for hold, active_at_start in zip(
-            group.jacobians.peer_type.holds, group.schedule.active_at_start, strict=True
+            peer_class.jacobians.peer_type.holds, peer_class.schedule.active_at_start, strict=True
         )
         if active_at_start is not None
     ]
-    coupling_terms = [received.coupling_term for group in subsystems for received in group.schedule.received]
+    coupling_terms = [
+        received.coupling_term for peer_class in subsystems for received in peer_class.schedule.received
+    ]
     forces = dict.fromkeys(hold.clock for hold in holds)
     networks = dict.fromkeys(term.clock or link_clock[term.link] for term in coupling_terms)
     missing = [
         text
-        for group in {subsystem.index: subsystem for subsystem in subsystems}.values()
-        for text in _form_differences(group)
+        for peer_class in {peer_class.index: peer_class for peer_class in subsystems}.values()
+        for text in _form_differences(peer_class)
     ]
     if any(link.after for link in model.links):
         missing.append("packets that take the values before the ticks (order: before)")
@@ -608,10 +617,10 @@ def _periods(model: Model, subsystems: Sequence[PeerClass]) -> tuple[Fraction, F
     return period, frame
 
 
-def _form_differences(group: PeerClass) -> Iterator[str]:
+def _form_differences(peer_class: PeerClass) -> Iterator[str]:
     """Yield the properties of the paper's form that a peer's own equations do not have."""
-    peer_type, pattern = group.jacobians.peer_type, group.jacobians.pattern
-    if not group.subsystem.affine:
+    peer_type, pattern = peer_class.jacobians.peer_type, peer_class.jacobians.pattern
+    if not peer_class.subsystem.affine:
         yield f"linear equations ({peer_type.name} is not linear)"
     for partition, tick in zip(peer_type.clocks, pattern.ticks, strict=True):
         if partition.variants:

@@ -45,8 +45,8 @@ from apc.mean_square.class_moments import (
     Classes,
     build_reception,
     classes_of,
+    common_modal_system,
     moments_of,
-    peer_classes,
     stored_of,
 )
 from apc.mean_square.mean_dynamics import Route, RouteMemory
@@ -110,8 +110,8 @@ def prove_mean_square(model: Model, ranges: Sequence[Range], *, cells: int | Non
             if not stays_rigid(
                 loop_without_packets,
                 [
-                    problem.subsystems[problem.indices[subsystem.name]]
-                    for subsystem in loop_without_packets.subsystems
+                    problem.subsystems[problem.indices[peer_class.name]]
+                    for peer_class in loop_without_packets.subsystems
                 ],
             ):
                 note = (
@@ -155,19 +155,23 @@ def _box_problem(model: Model, ranges: Sequence[Range]) -> _BoxProblem:
         _refuse_range(numeric.at(_model_at_point(model, ranges, point)), interval)
     parametric = parametric_subsystems(numeric, [ranges[index] for index in peer_ranges], lifted)
     reception = build_reception(numeric.at(parametric.at))
-    subsystems = tuple(parametric.subsystems[group.name] for group in reception.groups)
+    subsystems = tuple(parametric.subsystems[peer_class.name] for peer_class in reception.groups)
     frames = parametric_frames(subsystems, reception.groups)
     box = tuple((ranges[index].low, ranges[index].high) for index in peer_ranges)
     maps = [frame_map.mapped(lambda block: hull(block)[0]) for frame_map in frames_over(frames, (box,))]
-    lifted_wide = [group.with_lifted(frame) for group, frame in zip(reception.groups, maps, strict=True)]
-    loop_over_box = peer_classes(replace(reception, groups=tuple(lifted_wide)))[0]
+    lifted_wide = [
+        peer_class.with_lifted(frame) for peer_class, frame in zip(reception.groups, maps, strict=True)
+    ]
+    loop_over_box = common_modal_system(replace(reception, groups=tuple(lifted_wide)))[0]
     memories = stored_of(parametric.at, reception, loop_over_box)
     classes = classes_of(reception)
     indices = {
-        subsystem.name: next(
-            index for index, group in enumerate(reception.groups) if subsystem.peers.first in group.peers
+        peer_class.name: next(
+            index
+            for index, candidate in enumerate(reception.groups)
+            if peer_class.peers.first in candidate.peers
         )
-        for subsystem in classes.common.subsystems
+        for peer_class in classes.common.subsystems
     }
     return _BoxProblem(
         numeric, tuple(ranges), peer_ranges, classes, subsystems, frames, indices, loop_over_box, memories

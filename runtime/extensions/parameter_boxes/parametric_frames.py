@@ -62,9 +62,14 @@ def parametric_models(
     for interval in ranges:
         refuse_channel_number(numeric.model, interval.free, LOCATION)
     subsystems = parametric_subsystems(numeric, ranges, lambda changed: lifted_classes(numeric.at(changed)))
-    subsystem_of_class = {group.index: subsystems.subsystems[group.name] for group in subsystems.groups}
+    subsystem_of_class = {
+        peer_class.index: subsystems.subsystems[peer_class.name] for peer_class in subsystems.groups
+    }
     return [
-        (closed_system, tuple(subsystem_of_class[group.index] for group in closed_system.subsystems))
+        (
+            closed_system,
+            tuple(subsystem_of_class[peer_class.index] for peer_class in closed_system.subsystems),
+        )
         for closed_system in split(subsystems.groups, subsystems.comm_graph)
     ]
 
@@ -118,10 +123,10 @@ def parametric_subsystems(
     at = apply(model, point)
     groups, comm_graph = lifted(at)
     subsystems = {
-        group.name: _parametric_subsystem(
-            group, symbolic_parameters[comm_graph.group_of(group.peers.first)], model
+        peer_class.name: _parametric_subsystem(
+            peer_class, symbolic_parameters[comm_graph.group_of(peer_class.peers.first)], model
         )
-        for group in groups
+        for peer_class in groups
     }
     return ParametricSubsystems(at, groups, comm_graph, subsystems)
 
@@ -187,13 +192,15 @@ _RULES: dict[str, Callable[..., Any]] = {
 }
 
 
-def _parametric_subsystem(group: PeerClass, symbolic: Mapping[str, Ratio], model: Model) -> LinearSubsystem:
+def _parametric_subsystem(
+    peer_class: PeerClass, symbolic: Mapping[str, Ratio], model: Model
+) -> LinearSubsystem:
     """Return the matrices of a class of peers with the parameters of the box as symbols."""
-    peer_type = group.jacobians.peer_type
-    numbers = zip(peer_type.parameters, group.exact_parameters, strict=True)
+    peer_type = peer_class.jacobians.peer_type
+    numbers = zip(peer_type.parameters, peer_class.exact_parameters, strict=True)
     vector = [symbolic.get(name, value) for name, value in numbers]
     try:
-        return parametric_subsystem(group.jacobians, vector)
+        return parametric_subsystem(peer_class.jacobians, vector)
     except NotRational as reason:
-        message = f"an equation of {group.name} {reason}"
+        message = f"an equation of {peer_class.name} {reason}"
         raise ApcError(Diagnostic("E832", SourceLocation(model.origin.topology), message)) from None

@@ -123,7 +123,7 @@ def _spectrum(
     gain: float,
 ) -> Spectrum:
     """Return the spectrum of the model with linear contacts of a reduced stiffness."""
-    scaled_groups = [with_gain(group, forces, Fraction(gain)) for group, forces in groups]
+    scaled_groups = [with_gain(peer_class, forces, Fraction(gain)) for peer_class, forces in groups]
     return solve_spectrum(
         [close_loop(modal_system) for modal_system in decompose(scaled_groups, comm_graph).loops]
     )

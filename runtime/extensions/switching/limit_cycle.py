@@ -191,11 +191,11 @@ def _contacts(
     comm_graph = build_comm_graph(model, resolve(model).timings)
     peers_per_group = max(1, MOST_PEERS // len(groups))
     result = []
-    for group, forces in groups:
-        for peer in itertools.islice(group.peers, peers_per_group):
+    for peer_class, forces in groups:
+        for peer in itertools.islice(peer_class.peers, peers_per_group):
             name = comm_graph.peer_name(peer)
             for push in forces:
-                states = group.jacobians.peer_type.states
+                states = peer_class.jacobians.peer_type.states
                 indices = [k for k, state in enumerate(states) if state.unit == LENGTH and push.slopes[k]]
                 if push.slopes[push.states :].any() or not indices:
                     raise _no_limit_cycle(model, f"{push.part} depends on more than positions and velocities")

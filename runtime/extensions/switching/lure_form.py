@@ -67,7 +67,7 @@ class CutPeers:
     only. `jumps` is as for `LurePlant`.
     """
 
-    group: PeerClass
+    peer_class: PeerClass
     map: FrameMap
     states: int
     ticks: tuple[tuple[str, int], ...]
@@ -150,21 +150,21 @@ def contact_groups(numeric: NumericModel) -> list[tuple[PeerClass, tuple[SectorN
     return pairs
 
 
-def with_gain(group: PeerClass, forces: Sequence[SectorNonlinearity], gain: Fraction) -> PeerClass:
+def with_gain(peer_class: PeerClass, forces: Sequence[SectorNonlinearity], gain: Fraction) -> PeerClass:
     """Return peers whose contacts are always on, with forces scaled by a factor.
 
     Parameters
     ----------
-    group, forces
+    peer_class, forces
         As for `contact_groups`.
     gain
         The factor.
     """
     subsystem, exact = (
         _with_scaled_forces(linear_subsystem, forces, gain)
-        for linear_subsystem in (group.subsystem, group.exact)
+        for linear_subsystem in (peer_class.subsystem, peer_class.exact)
     )
-    return group.with_subsystem(subsystem, exact, group.schedule)
+    return peer_class.with_subsystem(subsystem, exact, peer_class.schedule)
 
 
 def _with_scaled_forces(
@@ -188,16 +188,16 @@ def lure_plants(numeric: NumericModel) -> list[LurePlant]:
     Raises NotSupportedError with the reason if the form does not exist.
     """
     cut_classes: list[CutPeers] = []
-    for group, forces in contact_groups(numeric):
+    for peer_class, forces in contact_groups(numeric):
         for force in forces:
             if force.sector and not force.shares:
                 raise NotSupportedError(force.sector)
-        cut_classes.append(_cut_peers(group, forces))
-    cut_of_class = {item.group.index: item for item in cut_classes}
-    loops = orthogonal_loops([item.group for item in cut_classes], numeric.comm_graph, LURE_STATES)
+        cut_classes.append(_cut_peers(peer_class, forces))
+    cut_of_class = {item.peer_class.index: item for item in cut_classes}
+    loops = orthogonal_loops([item.peer_class for item in cut_classes], numeric.comm_graph, LURE_STATES)
     result = []
     for modal_system in loops:
-        cut_groups = [cut_of_class[subsystem.index] for subsystem in modal_system.subsystems]
+        cut_groups = [cut_of_class[peer_class.index] for peer_class in modal_system.subsystems]
         size = modal_system.states + sum(len(cut_classes.ticks) for cut_classes in cut_groups)
         if size > LURE_STATES:
             raise NotSupportedError(f"{size:,} coupled states and contact ticks; the limit is {LURE_STATES}")
@@ -205,9 +205,9 @@ def lure_plants(numeric: NumericModel) -> list[LurePlant]:
     return result
 
 
-def _cut_peers(group: PeerClass, forces: Sequence[SectorNonlinearity]) -> CutPeers:
+def _cut_peers(peer_class: PeerClass, forces: Sequence[SectorNonlinearity]) -> CutPeers:
     """Return peers with their contacts cut open: contact forces are inputs, their variables y outputs."""
-    schedule, without_forces = group.schedule, with_gain(group, forces, Fraction(0))
+    schedule, without_forces = peer_class.schedule, with_gain(peer_class, forces, Fraction(0))
     steps = step_durations(schedule)
     discretized = discretize(
         without_forces.exact.a, without_forces.exact.b, [step * schedule.quantum for step in steps]
@@ -217,9 +217,9 @@ def _cut_peers(group: PeerClass, forces: Sequence[SectorNonlinearity]) -> CutPee
     for force in forces:
         count = schedule.ticks[force.partition]
         ticks += [(force.part, index) for index in range(count)]
-        slopes += [group.exact.ticks[force.partition].x[force.output]] * count
+        slopes += [peer_class.exact.ticks[force.partition].x[force.output]] * count
     extended, extended_schedule = with_cuts(
-        group.subsystem, schedule, [(force.partition, force.output) for force in forces]
+        peer_class.subsystem, schedule, [(force.partition, force.output) for force in forces]
     )
     extended_map = compose(
         with_roundings(extended),
@@ -244,10 +244,10 @@ def _lure_plant(modal_system: ModalSystem, cut_classes: Sequence[CutPeers]) -> L
     if rigid.drifts:
         raise NotSupportedError("with all contacts open, a rigid-body motion grows without bound")
     names = [
-        (*cut_peers.group.z_names, *(f"{part}[{tick}]" for part, tick in cut_peers.ticks))
+        (*cut_peers.peer_class.z_names, *(f"{part}[{tick}]" for part, tick in cut_peers.ticks))
         for cut_peers in cut_classes
     ]
-    layout = lay_out(names, [subsystem.schedule for subsystem in modal_system.subsystems])
+    layout = lay_out(names, [peer_class.schedule for peer_class in modal_system.subsystems])
     closed = interconnect_with_inputs(
         modal_system,
         [cut_peers.map for cut_peers in cut_classes],
@@ -265,7 +265,7 @@ def _lure_plant(modal_system: ModalSystem, cut_classes: Sequence[CutPeers]) -> L
     state_rows = np.delete(np.arange(n), port_rows)
     a, b = (closed[:, state_rows][..., columns] for columns in (state_rows, slice(n, None)))
     c, d = (closed[:, port_rows][..., columns] for columns in (state_rows, slice(n, None)))
-    ports = tuple((subsystem.name, *tick) for subsystem, cut_peers, _ in placed for tick in cut_peers.ticks)
+    ports = tuple((peer_class.name, *tick) for peer_class, cut_peers, _ in placed for tick in cut_peers.ticks)
     coordinates = with_uncertainty(relative_coordinates(rigid.basis))
     drift_output, drift_input = np.zeros(0, dtype=object), np.zeros((2, 1, len(ports)))
     if rigid.exact:
@@ -297,7 +297,7 @@ def _lure_plant(modal_system: ModalSystem, cut_classes: Sequence[CutPeers]) -> L
         d=negated(d),
         ports=ports,
         counts=np.array(
-            [float(subsystem.count) for subsystem, cut_peers, _ in placed for _ in cut_peers.ticks]
+            [float(peer_class.count) for peer_class, cut_peers, _ in placed for _ in cut_peers.ticks]
         ),
         measured=tuple(drift_output),
         moved=drift_input,
