@@ -172,13 +172,13 @@ def near_start(numeric: NumericModel) -> tuple[str, ...]:
         return elements
     try:
         all_sides = sides(numeric)
-        groups, _ = lifted_classes(all_sides[0].numeric)
+        peer_classes, _ = lifted_classes(all_sides[0].numeric)
     except ApcError:  # no result with these values
         return (*elements, AT_REST if at_rest else NOT_LINEAR)
     return (
         *_kink_limitation([side.name for side in all_sides]),
         *elements,
-        *_start_limitations(groups, at_rest=at_rest),
+        *_start_limitations(peer_classes, at_rest=at_rest),
     )
 
 
@@ -190,22 +190,22 @@ def _kink_limitation(names: Sequence[str]) -> tuple[str, ...]:
     return (f"the start is at a kink ({shown}): the worst side decides",)
 
 
-def _start_limitations(groups: Sequence[PeerClass], *, at_rest: bool) -> tuple[str, ...]:
+def _start_limitations(peer_classes: Sequence[PeerClass], *, at_rest: bool) -> tuple[str, ...]:
     """Return the limitations of a linearized model: a motion at the start values, and the nonlinearity.
 
     Parameters
     ----------
-    groups
+    peer_classes
         The classes of peers, linearized.
     at_rest
         Whether the start values are those of the equilibrium, where nothing moves.
     """
     if at_rest:
         return (AT_REST,)
-    moves = equilibrium_residual(groups)
+    moves = equilibrium_residual(peer_classes)
     if not moves:
         return (NOT_LINEAR,)
-    timed = any(depends_on_time(peer_class.jacobians.peer_type) for peer_class in groups)
+    timed = any(depends_on_time(peer_class.jacobians.peer_type) for peer_class in peer_classes)
     return f"{moves}; {SIMULATED if timed else f'{SIMULATED}; {AT_EQUILIBRIUM}'}", NOT_LINEAR
 
 
@@ -359,7 +359,7 @@ def _analyze(side: Side, *, method: str, certify: bool, exact_work: float) -> An
         proof=proof,
         limitations=(
             *elements,
-            *(_start_limitations(plan.groups, at_rest=model.at_equilibrium) if nonlinear else ()),
+            *(_start_limitations(plan.peer_classes, at_rest=model.at_equilibrium) if nonlinear else ()),
             *limitations(model),
         ),
         unobservable=neutral_modes.names,
@@ -379,20 +379,20 @@ def _spectrum(
     model = numeric.model
     plan = make_plan(numeric, method)
     notes: tuple[Note, ...] = ()
-    if not plan.groups:
+    if not plan.peer_classes:
         spectrum, notes = _solve_populations(numeric)
     elif plan.method == "determinant":
         spectrum = _solve_determinant(plan.loops)
         matrices_fit = all(modal_system.states <= MATRIX_STATES for modal_system in plan.loops)
         if method == "auto" and spectrum.stable is None and matrices_fit:
-            decomposed = decompose(plan.groups, numeric.comm_graph)
+            decomposed = decompose(plan.peer_classes, numeric.comm_graph)
             plan = replace(plan, method=decomposed.method, notes=decomposed.notes)
             spectrum = _solve_closed(model, plan.loops, certify=certify, exact_work=exact_work)
     else:
         spectrum = _solve_closed(model, plan.loops, certify=certify, exact_work=exact_work)
     if method == "determinant" and not np.isfinite(spectrum.spectral_radius_error):
         raise cannot_serve(model, method, "rounding within a frame exceeds the eigenvalues of single peers")
-    if certify and (not plan.groups or plan.method == "determinant"):
+    if certify and (not plan.peer_classes or plan.method == "determinant"):
         notes = (*notes, Limitation(LimitationCode.NO_BALLS, (plan.method,)))
     return plan, spectrum, notes
 
@@ -415,7 +415,10 @@ def _neutral_modes(
     counts as a translation.
     """
     if not spectrum.rigid_modes or not any(
-        map(_has_other_states, (*population, *(g for modal_system in loops for g in modal_system.subsystems)))
+        map(
+            _has_other_states,
+            (*population, *(g for modal_system in loops for g in modal_system.peer_classes)),
+        )
     ):
         return NeutralModes(spectrum.rigid_modes, 0, spectrum.drifts, 0, ())
     systems: Sequence[tuple[ModalSystem, int]] = [

@@ -65,7 +65,7 @@ class AnalysisPlan:
     """
 
     method: str
-    groups: tuple[PeerClass, ...]
+    peer_classes: tuple[PeerClass, ...]
     loops: tuple[ModalSystem, ...]
     systems: tuple[tuple[int, int], ...]
     notes: tuple[str, ...]
@@ -124,8 +124,8 @@ def make_plan(numeric: NumericModel, method: str = "auto") -> AnalysisPlan:
         if method == "determinant":
             reason = f"the peers differ and are not completely connected over {sparse[0]}"
             raise cannot_serve(model, method, reason)
-    groups = classes_of_peers(numeric)
-    if is_large_ring(groups, comm_graph):
+    peer_classes = classes_of_peers(numeric)
+    if is_large_ring(peer_classes, comm_graph):
         message = (
             f"a ring of {comm_graph.peers:,} peers has as many subsystems; the limit is {LARGEST_RING:,}"
         )
@@ -133,20 +133,20 @@ def make_plan(numeric: NumericModel, method: str = "auto") -> AnalysisPlan:
             Diagnostic("E804", SourceLocation(comm_graph.topology), message, fix=f"count: {LARGEST_RING}")
         )
     if method == "dense":
-        refuse_dense(groups, comm_graph)
-        loops: tuple[ModalSystem, ...] = (dense_loop(groups, comm_graph),)
+        refuse_dense(peer_classes, comm_graph)
+        loops: tuple[ModalSystem, ...] = (dense_loop(peer_classes, comm_graph),)
         chosen_method, notes = "dense", tuple[str, ...]()
     else:
-        decomposed = decompose(groups, comm_graph)
+        decomposed = decompose(peer_classes, comm_graph)
         if method == "modes" and decomposed.method != "modes":
             raise cannot_serve(model, method, decomposed.notes[0])
         loops, chosen_method, notes = decomposed.loops, decomposed.method, decomposed.notes
         packets = max(
-            sum(sum(peer_class.schedule.depths) for peer_class in modal_system.subsystems)
+            sum(sum(peer_class.schedule.depths) for peer_class in modal_system.peer_classes)
             for modal_system in loops
         )
         stored_outputs = max(
-            sum(len(peer_class.schedule.discrete_states) for peer_class in modal_system.subsystems)
+            sum(len(peer_class.schedule.discrete_states) for peer_class in modal_system.peer_classes)
             for modal_system in loops
         )
         if method == "determinant":
@@ -155,7 +155,7 @@ def make_plan(numeric: NumericModel, method: str = "auto") -> AnalysisPlan:
             any(
                 _long_lines(peer_class.schedule)
                 for modal_system in loops
-                for peer_class in modal_system.subsystems
+                for peer_class in modal_system.peer_classes
             )
             or (
                 packets + stored_outputs > LONG_LINES
@@ -180,7 +180,7 @@ def make_plan(numeric: NumericModel, method: str = "auto") -> AnalysisPlan:
         )
     else:
         needed_bytes = sum(_determinant_memory(modal_system) for modal_system in loops)
-        subsystems = sum(len(modal_system.subsystems) for modal_system in loops)
+        subsystems = sum(len(modal_system.peer_classes) for modal_system in loops)
         message = f"{len(loops):,} determinants of {subsystems:,} different peers"
     refuse_beyond(
         needed_bytes,
@@ -189,7 +189,7 @@ def make_plan(numeric: NumericModel, method: str = "auto") -> AnalysisPlan:
         message,
         "reduce the number of different peers or of states",
     )
-    return AnalysisPlan(chosen_method, groups, loops, _sizes(loops, chosen_method), notes)
+    return AnalysisPlan(chosen_method, peer_classes, loops, _sizes(loops, chosen_method), notes)
 
 
 def _long_lines(schedule: Schedule) -> bool:
@@ -200,11 +200,11 @@ def _long_lines(schedule: Schedule) -> bool:
     return packets > max(LONG_LINES, MANY_FRAMES * len(schedule.sent))
 
 
-def is_large_ring(groups: Sequence[PeerClass], comm_graph: CommunicationGraph) -> bool:
+def is_large_ring(peer_classes: Sequence[PeerClass], comm_graph: CommunicationGraph) -> bool:
     """Return whether all peers are equal and form one ring of more than LARGEST_RING peers."""
-    coupling_terms = used_coupling_terms(peer_class.schedule for peer_class in groups)
+    coupling_terms = used_coupling_terms(peer_class.schedule for peer_class in peer_classes)
     shapes = {comm_graph.links[coupling_term.link].graph.shape for coupling_term in coupling_terms}
-    if len(groups) > 1 or shapes != {"ring"} or comm_graph.peers <= LARGEST_RING:
+    if len(peer_classes) > 1 or shapes != {"ring"} or comm_graph.peers <= LARGEST_RING:
         return False
     return not common_graph(coupling_terms, comm_graph)
 
@@ -218,7 +218,7 @@ def cannot_serve(model: Model, method: str, reason: str) -> ApcError:
 def _sizes(loops: Sequence[ModalSystem], method: str) -> tuple[tuple[int, int], ...]:
     """Return (count, size) of the loops: the size is in states, or in rows of the determinant."""
     sizes = Counter(
-        sum(len(peer_class.schedule.sent) for peer_class in modal_system.subsystems)
+        sum(len(peer_class.schedule.sent) for peer_class in modal_system.peer_classes)
         if method == "determinant"
         else modal_system.states
         for modal_system in loops
@@ -230,10 +230,10 @@ def _determinant_memory(modal_system: ModalSystem) -> int:
     """Return the memory in bytes of a loop's determinant, given by its numbers of sent and received
     values.
     """
-    entries = sum(len(peer_class.schedule.sent) for peer_class in modal_system.subsystems) * sum(
-        len(peer_class.schedule.received) for peer_class in modal_system.subsystems
+    entries = sum(len(peer_class.schedule.sent) for peer_class in modal_system.peer_classes) * sum(
+        len(peer_class.schedule.received) for peer_class in modal_system.peer_classes
     )
-    return (CACHE_SIZE_OF_SUBSYSTEM * len(modal_system.subsystems) + SUBSYSTEM_AT_WORK) * entries
+    return (CACHE_SIZE_OF_SUBSYSTEM * len(modal_system.peer_classes) + SUBSYSTEM_AT_WORK) * entries
 
 
 def not_populations(model: Model, jacobians: Sequence[SubsystemJacobians]) -> str:

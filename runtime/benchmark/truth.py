@@ -96,14 +96,14 @@ def _loops(model: Model) -> Sequence[ModalSystem]:
         raise NotSupportedError(f"{moving:,} states of different peers {TOO_LONG}")
     if model.peers > BALL_STATES and any(link.graph.shape not in SPLIT for link in model.links):
         raise NotSupportedError(f"{model.peers:,} peers on a graph {TOO_LONG}")
-    groups, comm_graph = lifted_classes(numeric_model(model))
-    loops = decompose(groups, comm_graph).loops
+    peer_classes, comm_graph = lifted_classes(numeric_model(model))
+    loops = decompose(peer_classes, comm_graph).loops
     if any(
         weight_error and coupling_term not in modal_system.surds
         for modal_system in loops
         for coupling_term, weight_error in modal_system.weight_errors.items()
     ):
-        loops = (dense_loop(groups, comm_graph),)  # the eigenvalues of the graph are not exact
+        loops = (dense_loop(peer_classes, comm_graph),)  # the eigenvalues of the graph are not exact
     if sum(modal_system.states**3 for modal_system in loops) > BALL_STATES**3:
         most = max(modal_system.states for modal_system in loops)
         raise NotSupportedError(f"the eigenvalues of one system of {most:,} states {TOO_LONG}")

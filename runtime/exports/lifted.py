@@ -176,8 +176,10 @@ def state_space(model: Model, *, open_at: str = "") -> StateSpace:
     ApcError
         E950 no such link or coupler; E951 too many states; and those of `analysis.lifted_classes`.
     """
-    groups, comm_graph = peers_of(numeric_model(model))
-    (a, b, c, d), (states, inputs, outputs), unpushed = lifted(model, groups, comm_graph, open_at, IN_FLOATS)
+    peer_classes, comm_graph = peers_of(numeric_model(model))
+    (a, b, c, d), (states, inputs, outputs), unpushed = lifted(
+        model, peer_classes, comm_graph, open_at, IN_FLOATS
+    )
     if not all(np.isfinite(block).all() for block in (a, b, c, d)):
         raise ApcError(Diagnostic("E806", SourceLocation(model.name), TOO_LARGE))
     frame_s, notes = description(model)
@@ -225,7 +227,7 @@ def made_by(model: Model) -> str:
 
 def lifted(
     model: Model,
-    groups: Sequence[PeerClass],
+    peer_classes: Sequence[PeerClass],
     comm_graph: CommunicationGraph,
     open_at: str,
     numbers: FrameNumbers,
@@ -236,7 +238,7 @@ def lifted(
     ----------
     model, open_at
         As for `state_space`.
-    groups, comm_graph
+    peer_classes, comm_graph
         The peers and the communication graph, from `analysis.lifted_classes`.
     numbers
         The numerical parts of the frame.
@@ -244,12 +246,12 @@ def lifted(
     with single_threaded(), finite_equations(model.name), np.errstate(all="ignore"):
         link = _link_of(model, open_at)
         driven_peers = [
-            _open_loop(model, peer_class, "" if link else open_at, numbers) for peer_class in groups
+            _open_loop(model, peer_class, "" if link else open_at, numbers) for peer_class in peer_classes
         ]
         _check_size(model, driven_peers)
         modal_system = dense_loop([item.peer_class for item in driven_peers], comm_graph)
         peers_of_class = {item.peer_class.index: item for item in driven_peers}
-        subsystems = [peers_of_class[peer_class.index] for peer_class in modal_system.subsystems]
+        subsystems = [peers_of_class[peer_class.index] for peer_class in modal_system.peer_classes]
         blocks, labels = _closed(
             modal_system, subsystems, link=link, open_at=open_at, arithmetic=numbers.arithmetic
         )
@@ -490,7 +492,7 @@ def _closed(
         The number type.
     """
     layout = lay_out_loop(modal_system)
-    n, peers = len(layout.names), [peer_class.name for peer_class in modal_system.subsystems]
+    n, peers = len(layout.names), [peer_class.name for peer_class in modal_system.peer_classes]
     received = [subsystem.peer_class.schedule.received for subsystem in subsystems]
     external_rows = [
         [

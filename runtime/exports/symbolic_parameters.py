@@ -76,8 +76,10 @@ def state_space_of(model: Model, *, open_at: str = "", symbolic: Sequence[str] =
     if numeric is None:
         message = "the point of linearization depends on more than the parameters"
         raise ApcError(Diagnostic("E954", SourceLocation(OPTION), message, advice=f"omit {OPTION}"))
-    groups, comm_graph = peers_of(numeric)
-    groups = tuple(part for peer_class in groups for part in _split_by_groups(peer_class, comm_graph))
+    peer_classes, comm_graph = peers_of(numeric)
+    peer_classes = tuple(
+        part for peer_class in peer_classes for part in _split_by_groups(peer_class, comm_graph)
+    )
     values = dict(zip(parameter_refs, symbols, strict=True))
 
     def vector(peer_class: PeerClass) -> Any:
@@ -87,7 +89,7 @@ def state_space_of(model: Model, *, open_at: str = "", symbolic: Sequence[str] =
         entries = free_values(model, model.groups[index], peer, values, symbolic_function)
         return casadi.vertcat(*map(casadi.SX, entries))
 
-    blocks, _, _ = lifted(model, groups, comm_graph, open_at, _numbers(vector))
+    blocks, _, _ = lifted(model, peer_classes, comm_graph, open_at, _numbers(vector))
     function = casadi.Function(
         "state_space", symbols, [*map(_matrix, blocks)], words(ports), ["A", "B", "C", "D"]
     )

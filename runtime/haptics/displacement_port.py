@@ -121,14 +121,14 @@ def port_loops(numeric: NumericModel, *, option: str) -> tuple[PortLoop, ...]:
         The reason why no device is ever passive.
     """
     model = numeric.model
-    groups, comm_graph = lifted_classes(numeric)
+    peer_classes, comm_graph = lifted_classes(numeric)
     location, unit_of = (
         SourceLocation(model.origin.topology),
         {parameter.name: parameter.unit for parameter in model.parameters},
     )
     received = {
         (receive.link, row)
-        for peer_class in groups
+        for peer_class in peer_classes
         for partition, tick in zip(peer_class.jacobians.peer_type.clocks, peer_class.exact.ticks, strict=True)
         for receive, column, rows in zip(partition.receives, tick.r.T, tick.channels, strict=True)
         if column.astype(np.bool_).any()
@@ -137,7 +137,7 @@ def port_loops(numeric: NumericModel, *, option: str) -> tuple[PortLoop, ...]:
     direct = coupled_directly(model.peer_types)
     device_inputs: dict[int, _DeviceInput] = {}
     with_inputs: list[PeerClass] = []
-    for peer_class in groups:
+    for peer_class in peer_classes:
         device = find_device(
             peer_class.jacobians, peer_class.parameters, unit_of, peer_class.initial_reception, direct=direct
         )
@@ -156,14 +156,18 @@ def port_loops(numeric: NumericModel, *, option: str) -> tuple[PortLoop, ...]:
         with_inputs.append(device_input.peer_class)
     if not device_inputs:
         raise no_device(model, option)
-    used = {received.coupling_term.link for peer_class in groups for received in peer_class.schedule.received}
+    used = {
+        received.coupling_term.link
+        for peer_class in peer_classes
+        for received in peer_class.schedule.received
+    }
     is_orthogonal = all(comm_graph.links[link].graph.shape in ORTHOGONAL for link in used)
     loops, weighted = accepted_loops(with_inputs, comm_graph, lambda _: is_orthogonal, option)
     result = []
     for modal_system in loops:
         # A loop without devices is one of the model with its devices clamped.
-        if any(peer_class.index in device_inputs for peer_class in modal_system.subsystems):
-            represents_all = weighted and len(modal_system.subsystems) > 1
+        if any(peer_class.index in device_inputs for peer_class in modal_system.peer_classes):
+            represents_all = weighted and len(modal_system.peer_classes) > 1
             result.append(
                 _port_loop(
                     modal_system,
@@ -300,11 +304,11 @@ def _port_loop(
     """
     gripped = [
         number
-        for number, peer_class in enumerate(modal_system.subsystems)
+        for number, peer_class in enumerate(modal_system.peer_classes)
         if peer_class.index in device_inputs
     ]
-    subsystems = [device_inputs[modal_system.subsystems[number].index] for number in gripped]
-    counts = [modal_system.subsystems[number].count if represents_all else 1 for number in gripped]
+    subsystems = [device_inputs[modal_system.peer_classes[number].index] for number in gripped]
+    counts = [modal_system.peer_classes[number].count if represents_all else 1 for number in gripped]
     lengths = [len(subsystem.seconds) for subsystem in subsystems]
     if (m := sum(lengths)) > MOST_INTERVALS:
         message = f"different devices have {m:,} intervals of sampling and force in a frame"

@@ -166,7 +166,7 @@ def driven_mode(modal_system: ModalSystem, subsystems: Mapping[int, DrivenPeer])
         The loop of classes from `driven_subsystem`, and their driven peers by the index of the class.
     """
     closed = close_loop(modal_system)
-    driven_peers = [subsystems[peer_class.index] for peer_class in modal_system.subsystems]
+    driven_peers = [subsystems[peer_class.index] for peer_class in modal_system.peer_classes]
     closed_matrix = with_error_radius(closed.matrix, closed.error)
     pairs = list(zip(closed.offsets, driven_peers, strict=True))
     added = [start + index for start, subsystem in pairs for index in subsystem.ports.added]

@@ -69,11 +69,11 @@ def responses(numeric: NumericModel, port: DevicePort, other: DevicePort) -> Res
         E931 a peer without a device; E933 a model too large.
     """
     model = numeric.model
-    groups, comm_graph = lifted_classes(numeric)
+    peer_classes, comm_graph = lifted_classes(numeric)
     unit_of = {parameter.name: parameter.unit for parameter in model.parameters}
     direct = coupled_directly(model.peer_types)
     driven_classes, subsystems, gripped = [], {}, {}
-    for peer_class in groups:
+    for peer_class in peer_classes:
         device = None
         for device_port in (other, port):
             if device_port.peer not in peer_class.peers:
@@ -96,11 +96,13 @@ def responses(numeric: NumericModel, port: DevicePort, other: DevicePort) -> Res
         subsystems[peer_group.index] = subsystem
     plain, driven_loops = (
         accepted_loops(classes, comm_graph, _are_by_class, "apc transparency")[0]
-        for classes in (groups, driven_classes)
+        for classes in (peer_classes, driven_classes)
     )
     common = driven_loops[0]
-    if (states := sum(len(peer_class.z_names) for peer_class in common.subsystems)) > MOST_TOGETHER:
-        message = f"{len(common.subsystems):,} different peers have {states:,} states and samples in a frame"
+    if (states := sum(len(peer_class.z_names) for peer_class in common.peer_classes)) > MOST_TOGETHER:
+        message = (
+            f"{len(common.peer_classes):,} different peers have {states:,} states and samples in a frame"
+        )
         advice = f"reduce the number of different peers (limit: {MOST_TOGETHER:,})"
         raise ApcError(
             Diagnostic(
@@ -110,16 +112,16 @@ def responses(numeric: NumericModel, port: DevicePort, other: DevicePort) -> Res
     driven_index, other_index = (
         next(
             index
-            for index, peer_class in enumerate(common.subsystems)
+            for index, peer_class in enumerate(common.peer_classes)
             if device_port.peer in peer_class.peers
         )
         for device_port in (port, other)
     )
-    name = common.subsystems[driven_index].name
+    name = common.peer_classes[driven_index].name
     difference_loops = [
         number
         for number, modal_system in enumerate(driven_loops)
-        if number and modal_system.subsystems[0].name == name
+        if number and modal_system.peer_classes[0].name == name
     ]
     return Responses(
         comm_graph=comm_graph,
@@ -127,7 +129,7 @@ def responses(numeric: NumericModel, port: DevicePort, other: DevicePort) -> Res
         other=gripped[other],
         loops=tuple(driven_mode(modal_system, subsystems) for modal_system in driven_loops),
         plain=plain,
-        members=tuple(peer_class.count for peer_class in common.subsystems),
+        members=tuple(peer_class.count for peer_class in common.peer_classes),
         local=driven_index,
         to=other_index,
         unpaired=difference_loops[0] if difference_loops else None,
@@ -190,10 +192,10 @@ def _check_increments(model: Model, peer_class: PeerClass) -> None:
 def _are_by_class(loops: Sequence[ModalSystem]) -> bool:
     """Return whether loops are a common loop and a difference loop per class; a ring has other modes."""
     common, *difference_loops = loops
-    many = {peer_class.name: peer_class.count - 1 for peer_class in common.subsystems}
+    many = {peer_class.name: peer_class.count - 1 for peer_class in common.peer_classes}
     return all(
-        len(modal_system.subsystems) == 1
-        and modal_system.multiplicity == many.get(modal_system.subsystems[0].name)
+        len(modal_system.peer_classes) == 1
+        and modal_system.multiplicity == many.get(modal_system.peer_classes[0].name)
         for modal_system in difference_loops
     )
 

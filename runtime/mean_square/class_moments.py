@@ -71,7 +71,7 @@ PERFECT = ChannelLaw(0.0, 1.0, 0.0, 0.0, 0.0, 0.0, "uniform", None)
 class PerTickReception:
     """The peers of a model with a separate reception at each tick: `rows` lists them by class."""
 
-    groups: tuple[PeerClass, ...]
+    peer_classes: tuple[PeerClass, ...]
     comm_graph: CommunicationGraph
     rows: Mapping[int, tuple[UncertainSample, ...]]
     timings: Mapping[str, Fraction]
@@ -81,7 +81,7 @@ class PerTickReception:
 
     def of(self, modal_system: ModalSystem) -> list[tuple[UncertainSample, ...]]:
         """Return the received sample of each row of r, for each subsystem of a loop."""
-        return [self.rows[peer_class.index] for peer_class in modal_system.subsystems]
+        return [self.rows[peer_class.index] for peer_class in modal_system.peer_classes]
 
 
 def build_reception(
@@ -118,14 +118,14 @@ def build_reception(
     shifted_system = replace(
         model, timings=tuple(replace(timing, value=timings[timing.name]) for timing in model.timings)
     )
-    groups, comm_graph = lifted_classes(replace(numeric, model=shifted_system, given_schedules=by_tick))
+    peer_classes, comm_graph = lifted_classes(replace(numeric, model=shifted_system, given_schedules=by_tick))
     rows = {
         peer_class.index: schedules[comm_graph.group_of(peer_class.peers.first)].selected
-        for peer_class in groups
+        for peer_class in peer_classes
     }
     strictly = numeric.order.index("tick") < numeric.order.index("deliver")
     frame, quantum = schedules[0].frame_s, schedules[0].quantum
-    return PerTickReception(groups, comm_graph, rows, timings, frame, quantum, strictly)
+    return PerTickReception(peer_classes, comm_graph, rows, timings, frame, quantum, strictly)
 
 
 def local_value(row: UncertainSample) -> SentSample:
@@ -206,17 +206,17 @@ class Classes:
     @property
     def counts(self) -> list[int]:
         """The number of peers of each class."""
-        return [peer_class.count for peer_class in self.common.subsystems]
+        return [peer_class.count for peer_class in self.common.peer_classes]
 
 
 def classes_of(reception: PerTickReception) -> Classes:
     """Return the classes of exchangeable peers of a model, with the loops and rigid motions of each."""
     common, weights = common_modal_system(reception)
     loops = []
-    for class_index, peer_class in enumerate(common.subsystems):
+    for class_index, peer_class in enumerate(common.peer_classes):
         one_peer = PeerIndices((range(peer_class.peers.first, peer_class.peers.first + 1),))
         subsystems = [(class_index, replace(peer_class, count=1, peers=one_peer), 1)]
-        for g, other in enumerate(common.subsystems):
+        for g, other in enumerate(common.peer_classes):
             first = int(g == class_index)
             if count := other.count - first:
                 candidates = count if first else peer_class.count
@@ -464,7 +464,7 @@ def _moment_classes(classes: Classes, memories: Sequence[RouteMemory]) -> list[_
 
 def neutral_motions(modal_system: ModalSystem) -> Floats:
     """Return the rigid modes of a loop over its subsystems' own states (n, d)."""
-    states = sum(len(peer_class.z_names) for peer_class in modal_system.subsystems)
+    states = sum(len(peer_class.z_names) for peer_class in modal_system.peer_classes)
     return find_rigid_modes(without_packets(modal_system), with_drifts=False).basis[:states]
 
 
@@ -474,20 +474,20 @@ def common_modal_system(reception: PerTickReception) -> tuple[ModalSystem, Coupl
     Peers of a class are exchangeable: each receives from all peers of a class, its own included, with equal
     weight, or from none.
     """
-    groups, comm_graph = reception.groups, reception.comm_graph
-    if not incomplete_links((peer_class.schedule for peer_class in groups), comm_graph):
-        degrees = complete_degrees(groups, comm_graph)
+    peer_classes, comm_graph = reception.peer_classes, reception.comm_graph
+    if not incomplete_links((peer_class.schedule for peer_class in peer_classes), comm_graph):
+        degrees = complete_degrees(peer_classes, comm_graph)
 
         def weight(coupling_term: CouplingTerm, g: int, h: int) -> Fraction:
             """Return 1 if a class has a peer that a peer of class g receives from, else 0."""
-            return Fraction(groups[h].count > (1 if g == h else 0))
+            return Fraction(peer_classes[h].count > (1 if g == h else 0))
 
-        return complete_loops(groups, comm_graph)[0], couple(groups, comm_graph, weight, degrees)
-    dense = dense_loop(groups, comm_graph)
+        return complete_loops(peer_classes, comm_graph)[0], couple(peer_classes, comm_graph, weight, degrees)
+    dense = dense_loop(peer_classes, comm_graph)
     common = split_exchangeable(dense, comm_graph)[0]
-    index = {peer_class.peers.first: number for number, peer_class in enumerate(dense.subsystems)}
-    first = [index[peer_class.peers.first] for peer_class in common.subsystems]
-    last = [index[peer_class.peers.last] for peer_class in common.subsystems]
+    index = {peer_class.peers.first: number for number, peer_class in enumerate(dense.peer_classes)}
+    first = [index[peer_class.peers.first] for peer_class in common.peer_classes]
+    last = [index[peer_class.peers.last] for peer_class in common.peer_classes]
     weights = {
         coupling_term: tuple(
             tuple(rows[g][last[k] if g == h else h] for k, h in enumerate(first)) for g in first
@@ -520,7 +520,7 @@ def stored_of(
         `receiver_memory.memory_of`.
     """
     received: dict[Route, list[UncertainSample]] = {}
-    for peer_class, rows in zip(common.subsystems, reception.of(common), strict=True):
+    for peer_class, rows in zip(common.peer_classes, reception.of(common), strict=True):
         size = peer_class.lifted.mapped(lambda block: np.abs(value_of(block)) + error_radius(block))
         is_used: Flags = np.any(size.q, axis=0) | np.any(size.d, axis=0)
         for index, row in enumerate(rows):

@@ -61,13 +61,13 @@ class Forced:
     reception: PerTickReception
     peers: Mapping[int, PeerReadings]
 
-    def of(self, subsystems: Sequence[PeerClass]) -> list[tuple[int, PeerReadings]]:
+    def of(self, peer_classes: Sequence[PeerClass]) -> list[tuple[int, PeerReadings]]:
         """Return the number of peers of each class, and the class's readings."""
-        return [(peer_class.count, self.peers[peer_class.index]) for peer_class in subsystems]
+        return [(peer_class.count, self.peers[peer_class.index]) for peer_class in peer_classes]
 
     def peer_by_peer(self) -> list[tuple[int, PeerReadings]]:
         """Return the readings of each peer, in the order of peers."""
-        return self.of(dense_loop(self.reception.groups, self.reception.comm_graph).subsystems)
+        return self.of(dense_loop(self.reception.peer_classes, self.reception.comm_graph).peer_classes)
 
 
 def forced(model: Model, reception: PerTickReception, first: Fraction = Fraction(0)) -> Forced:
@@ -95,19 +95,19 @@ def forced(model: Model, reception: PerTickReception, first: Fraction = Fraction
         key=lambda clock: reception.timings[clock.period],
     )
     ticks = instants(reception, fastest)
-    groups: list[PeerClass] = []
+    peer_classes: list[PeerClass] = []
     peers: dict[int, PeerReadings] = {}
-    for peer_class in reception.groups:
+    for peer_class in reception.peer_classes:
         device = find_device(
             peer_class.jacobians, peer_class.parameters, unit_of, peer_class.initial_reception, direct=direct
         )
         if isinstance(device, str):
             raise NotSupportedError(device)
         forced_group, peers[peer_class.index] = _forced(peer_class, device, ticks, -first % reception.frame)
-        groups.append(forced_group)
+        peer_classes.append(forced_group)
     if not any(peer.input_slots for peer in peers.values()):
         raise NotSupportedError("no peer has a device besides its object copies")
-    return Forced(replace(reception, groups=tuple(groups)), peers)
+    return Forced(replace(reception, peer_classes=tuple(peer_classes)), peers)
 
 
 def _forced(
@@ -194,7 +194,7 @@ def moments_error(peer_moments: Moments, classes: Sequence[tuple[int, PeerReadin
         subsystems = [
             (peer_class.count, classes[g][1])
             for peer_class, g in zip(
-                block_coordinates.loop.modal_system.subsystems, block_coordinates.loop.class_of, strict=True
+                block_coordinates.loop.modal_system.peer_classes, block_coordinates.loop.class_of, strict=True
             )
         ]
         for copy, index, row in _error_rows(

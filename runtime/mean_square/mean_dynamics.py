@@ -284,7 +284,7 @@ def mean_loop(
     memory_by_route = {item.route: item for item in memory}
     subsystems = [
         with_memory(peer_class, memory, frames[peer_class.name] if frames else None)
-        for peer_class in modal_system.subsystems
+        for peer_class in modal_system.peer_classes
     ]
     offsets = np.cumsum([0] + [subsystem.states for subsystem in subsystems]).tolist()
     starts = np.cumsum([0] + [subsystem.map.s.shape[-2] for subsystem in subsystems]).tolist()
@@ -391,7 +391,7 @@ def with_stored_values(
     ApcError
         E806 no fractions satisfy the equation within its error bounds, as entries overflow.
     """
-    sizes = [len(peer_class.z_names) for peer_class in modal_system.subsystems]
+    sizes = [len(peer_class.z_names) for peer_class in modal_system.peer_classes]
     state_indices = np.concatenate(
         [offset + np.arange(size) for offset, size in zip(offsets, sizes, strict=False)]
     )

@@ -211,7 +211,7 @@ def independent_growth(
     def errors() -> tuple[float, str]:
         """Return the copy error in m, and a note."""
         pushed = forced(model, reception, arrival)
-        classes = pushed.of(common_modal_system(pushed.reception)[0].subsystems)
+        classes = pushed.of(common_modal_system(pushed.reception)[0].peer_classes)
         return moments_error(moments(model, pushed.reception), classes), ""
 
     of = moments(model, reception)

@@ -279,9 +279,9 @@ def _family_of_strip(
 ) -> DirectFamily | None:
     """Return the matrices over a strip, step durations linear in the delay; None if rigid modes change."""
     assert segment.evaluator is not None, "something depends on the delay"
-    groups, comm_graph = lifted_classes(numeric.at(generic(segment.inside, parameter_refs[1:])))
+    peer_classes, comm_graph = lifted_classes(numeric.at(generic(segment.inside, parameter_refs[1:])))
     family = batch_evaluator(
-        segment.inside, parameter_refs, groups, comm_graph, durations=segment.evaluator.durations
+        segment.inside, parameter_refs, peer_classes, comm_graph, durations=segment.evaluator.durations
     )
 
     def errors(values: Floats) -> tuple[Floats, ...]:

@@ -54,9 +54,9 @@ def precision(bits: int) -> Iterator[None]:
 
 def unprovable(system: ClosedLoop | ModalSystem) -> str:
     """Return the reason why a system has no exact coefficients, "" if its coefficients are exact."""
-    if not system.subsystems:
+    if not system.peer_classes:
         return "its matrix was not composed from those of peers"
-    for peer_class in {peer_class.index: peer_class for peer_class in system.subsystems}.values():
+    for peer_class in {peer_class.index: peer_class for peer_class in system.peer_classes}.values():
         functions = [
             peer_class.jacobians.function,
             *(edge.function for edge in peer_class.jacobians.edges.values()),
@@ -83,7 +83,7 @@ def subsystem_balls(system: ClosedLoop | ModalSystem) -> list[LinearSubsystem]:
     """
     converted: dict[int, LinearSubsystem] = {}
     linear_subsystems = []
-    for peer_class in system.subsystems:
+    for peer_class in system.peer_classes:
         if peer_class.index not in converted:
             converted[peer_class.index] = entrywise(peer_class.exact, rational_ball)
         linear_subsystems.append(converted[peer_class.index])
@@ -108,7 +108,7 @@ def frame_balls(system: ClosedLoop | ModalSystem) -> Balls:
     subsystems = subsystem_balls(system)
     computed: dict[int, Steps] = {}
     steps = []
-    for subsystem, peer_class in zip(subsystems, system.subsystems, strict=True):
+    for subsystem, peer_class in zip(subsystems, system.peer_classes, strict=True):
         if peer_class.index not in computed:
             computed[peer_class.index] = frame_steps(subsystem, peer_class.schedule)
         steps.append(computed[peer_class.index])
@@ -149,7 +149,7 @@ def closed_frame(
     start = np.eye(n, dtype=np.int64).astype(object) if state is None else state
     index_of = layout.indices
     rows_of = [
-        {sent: row for row, sent in enumerate(peer_class.schedule.sent)} for peer_class in system.subsystems
+        {sent: row for row, sent in enumerate(peer_class.schedule.sent)} for peer_class in system.peer_classes
     ]
     weights = weight_balls(system) if weights is None else weights
     sent: dict[tuple[int, int], Balls] = {}
@@ -159,7 +159,7 @@ def closed_frame(
 
         def receive(input_row: int) -> Balls | None:
             """Return a received value over the columns, None if a packet is not sent yet."""
-            received = system.subsystems[g].schedule.received[input_row]
+            received = system.peer_classes[g].schedule.received[input_row]
             total = np.zeros(start.shape[1], dtype=object)
             for h, weight in weights[received.coupling_term][g]:
                 row = rows_of[h][received.sent]
@@ -187,7 +187,7 @@ def closed_frame(
             watch=watch and functools.partial(watch, g),
         )
         for g, (peer_class, subsystem, step, offset) in enumerate(
-            zip(system.subsystems, subsystems, steps, layout.offsets, strict=True)
+            zip(system.peer_classes, subsystems, steps, layout.offsets, strict=True)
         )
     }
     while mode_paths:

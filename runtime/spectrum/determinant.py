@@ -149,13 +149,13 @@ def population_characteristic(
 
 
 def loop_characteristic(
-    groups: Sequence[PeerClass], coupling: Coupling, weight_errors: Mapping[CouplingTerm, float]
+    peer_classes: Sequence[PeerClass], coupling: Coupling, weight_errors: Mapping[CouplingTerm, float]
 ) -> tuple[Characteristic, tuple[TransferMember, ...]]:
     """Return the characteristic function of a few coupled subsystems, with delays of any length.
 
     Parameters
     ----------
-    groups
+    peer_classes
         The K subsystems.
     coupling
         The coupling weights W (K, K) by coupling term.
@@ -164,7 +164,7 @@ def loop_characteristic(
     """
     n_s = n_r = 0
     members = []
-    for peer_class in groups:
+    for peer_class in peer_classes:
         schedule, maps = peer_class.schedule, peer_class.lifted.mapped(lambda block: block[None])
         rows, lines = np.arange(n_s, n_s + len(schedule.sent)), np.arange(n_r, n_r + len(schedule.received))
         n_s, n_r = n_s + len(rows), n_r + len(lines)
@@ -176,7 +176,9 @@ def loop_characteristic(
             )
         )
     transfer = transfer_of([member.subsystems for member in members], n_s, n_r)
-    return characteristic_of(transfer, *_feedback_weights(groups, coupling, weight_errors)), tuple(members)
+    return characteristic_of(transfer, *_feedback_weights(peer_classes, coupling, weight_errors)), tuple(
+        members
+    )
 
 
 def _subsystem_of(peer_class: PeerClass, _: int) -> LinearSubsystem:
@@ -185,13 +187,13 @@ def _subsystem_of(peer_class: PeerClass, _: int) -> LinearSubsystem:
 
 
 def _feedback_weights(
-    subsystems: Sequence[PeerClass], coupling: Coupling, weight_errors: Mapping[CouplingTerm, float]
+    peer_classes: Sequence[PeerClass], coupling: Coupling, weight_errors: Mapping[CouplingTerm, float]
 ) -> tuple[tuple[int, ...], Floats, Floats]:
     """Return the feedback from sent to received values of a loop's subsystems, r = Σ_l W_l ζ^(−l) s.
 
     Parameters
     ----------
-    subsystems
+    peer_classes
         The K subsystems.
     coupling
         The coupling weights W (K, K) by coupling term.
@@ -202,13 +204,13 @@ def _feedback_weights(
     -------
     The lags l, the weights W_l (l, n_r, n_s), and their error bounds.
     """
-    sent_starts = np.cumsum([0, *(len(peer_class.schedule.sent) for peer_class in subsystems)])
-    reception_starts = np.cumsum([0, *(len(peer_class.schedule.received) for peer_class in subsystems)])
-    lags = sorted({received.lag for peer_class in subsystems for received in peer_class.schedule.received})
+    sent_starts = np.cumsum([0, *(len(peer_class.schedule.sent) for peer_class in peer_classes)])
+    reception_starts = np.cumsum([0, *(len(peer_class.schedule.received) for peer_class in peer_classes)])
+    lags = sorted({received.lag for peer_class in peer_classes for received in peer_class.schedule.received})
     weights = np.zeros((2, len(lags), int(reception_starts[-1]), int(sent_starts[-1])))
-    for g, peer_class in enumerate(subsystems):
+    for g, peer_class in enumerate(peer_classes):
         for input_row, received in enumerate(peer_class.schedule.received):
-            for h, sender in enumerate(subsystems):
+            for h, sender in enumerate(peer_classes):
                 if received.sent in sender.schedule.sent:
                     row = sent_starts[h] + sender.schedule.sent.index(received.sent)
                     pair = bounded_weight(

@@ -90,7 +90,7 @@ def radius_in_floats(loops: Sequence[ModalSystem]) -> float:
     radii = []
     for modal_system in loops:
         function, _ = loop_characteristic(
-            modal_system.subsystems, modal_system.coupling, modal_system.weight_errors
+            modal_system.peer_classes, modal_system.coupling, modal_system.weight_errors
         )
         rigid = len(find_rigid_modes(without_packets(modal_system), with_drifts=False).names)
         radii.append(largest_zero(function, _loop_starts(function), rigid=rigid))
@@ -156,7 +156,7 @@ def _spectrum(solved: Sequence[_SolvedSystem], multiplicities: Sequence[int]) ->
 def _solve_loop(modal_system: ModalSystem) -> _SolvedSystem:
     """Return the zeros and the largest modes of a loop."""
     function, members = loop_characteristic(
-        modal_system.subsystems, modal_system.coupling, modal_system.weight_errors
+        modal_system.peer_classes, modal_system.coupling, modal_system.weight_errors
     )
     without_delays = without_packets(modal_system)
     rigid, drifts = len(find_rigid_modes(without_delays, with_drifts=False).names), 0

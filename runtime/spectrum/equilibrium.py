@@ -27,21 +27,23 @@ ROUNDED = 1e-12
 FORCES = ("N", "N*m")
 
 
-def equilibrium_residual(groups: Sequence[PeerClass]) -> str:
+def equilibrium_residual(peer_classes: Sequence[PeerClass]) -> str:
     """Return the largest unbalanced force at the start, as a text; "" at an equilibrium.
 
     Without an unbalanced force the text names the largest torque, and else a rate that is not 0.
 
     Parameters
     ----------
-    groups
+    peer_classes
         All peers of the topology; a group that is linear on its side of a kink is left out.
     """
-    linearized_groups = [peer_class for peer_class in groups if peer_class.initial_reception is not None]
+    linearized_groups = [
+        peer_class for peer_class in peer_classes if peer_class.initial_reception is not None
+    ]
     quantities = [
         quantity
         for peer_class in linearized_groups
-        for quantity in _unbalanced_quantities(peer_class, named=len(groups) > 1)
+        for quantity in _unbalanced_quantities(peer_class, named=len(peer_classes) > 1)
     ]
     for unit in FORCES:
         candidates = [

@@ -115,5 +115,7 @@ def graph_loop(peer_class: PeerClass, mode: GraphMode, scale: GraphScale) -> Mod
         coupling_term: ((weight * a, -weight * b), (weight * b, weight * a))
         for coupling_term, weight in weights.items()
     }
-    subsystems = tuple(replace(peer_class, name=part) for part in ("real", "imaginary"))
-    return ModalSystem(f"{name} ± {mode.value.imag:.6g}i", mode.multiplicity, subsystems, pair, weight_errors)
+    peer_classes = tuple(replace(peer_class, name=part) for part in ("real", "imaginary"))
+    return ModalSystem(
+        f"{name} ± {mode.value.imag:.6g}i", mode.multiplicity, peer_classes, pair, weight_errors
+    )

@@ -52,7 +52,7 @@ class ModalSystem:
 
     name: str
     multiplicity: int
-    subsystems: tuple[PeerClass, ...]
+    peer_classes: tuple[PeerClass, ...]
     coupling: Coupling
     weight_errors: Mapping[CouplingTerm, float] = field(default_factory=dict)
     surds: Mapping[CouplingTerm, Surd] = field(default_factory=dict)
@@ -62,7 +62,7 @@ class ModalSystem:
         """The packets in transit, in order of state."""
         return tuple(
             DelayedSample(h, row, lag)
-            for h, peer_class in enumerate(self.subsystems)
+            for h, peer_class in enumerate(self.peer_classes)
             for row, depth in enumerate(peer_class.schedule.depths)
             for lag in range(1, depth + 1)
         )
@@ -80,7 +80,7 @@ class ModalSystem:
     @property
     def states(self) -> int:
         """The number of states."""
-        return sum(states_of(peer_class.schedule, peer_class.jacobians) for peer_class in self.subsystems)
+        return sum(states_of(peer_class.schedule, peer_class.jacobians) for peer_class in self.peer_classes)
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,13 +108,13 @@ class StateLayout:
 
 def without_packets(modal_system: ModalSystem) -> ModalSystem:
     """Return the loop without packets in its state: the number of rigid modes is independent of delays."""
-    subsystems = tuple(
+    peer_classes = tuple(
         replace(
             peer_class, schedule=replace(peer_class.schedule, depths=(0,) * len(peer_class.schedule.depths))
         )
-        for peer_class in modal_system.subsystems
+        for peer_class in modal_system.peer_classes
     )
-    return replace(modal_system, subsystems=subsystems)
+    return replace(modal_system, peer_classes=peer_classes)
 
 
 def lay_out(z_names: Sequence[Sequence[str]], schedules: Sequence[Schedule]) -> StateLayout:
@@ -138,14 +138,17 @@ def lay_out(z_names: Sequence[Sequence[str]], schedules: Sequence[Schedule]) -> 
 
 def lay_out_loop(loop: ModalSystem | ClosedLoop) -> StateLayout:
     """Return the layout of a loop's state; for several subsystems each name includes its peer."""
-    groups = loop.subsystems
+    peer_classes = loop.peer_classes
     layout = lay_out(
-        [peer_class.z_names for peer_class in groups], [peer_class.schedule for peer_class in groups]
+        [peer_class.z_names for peer_class in peer_classes],
+        [peer_class.schedule for peer_class in peer_classes],
     )
-    if len(groups) == 1:
+    if len(peer_classes) == 1:
         return layout
     sizes = np.diff([*layout.offsets, len(layout.names)])
-    owners = (peer_class.name for peer_class, size in zip(groups, sizes, strict=True) for _ in range(size))
+    owners = (
+        peer_class.name for peer_class, size in zip(peer_classes, sizes, strict=True) for _ in range(size)
+    )
     return replace(
         layout, names=tuple(f"{owner}.{name}" for owner, name in zip(owners, layout.names, strict=True))
     )
@@ -163,7 +166,7 @@ class ClosedLoop:
 
     name: str
     multiplicity: int
-    subsystems: tuple[PeerClass, ...]
+    peer_classes: tuple[PeerClass, ...]
     coupling: Coupling
     frame_s: float
     layout: StateLayout
@@ -192,22 +195,22 @@ class ClosedLoop:
 
 def close_loop(loop: ModalSystem | ClosedLoop) -> ClosedLoop:
     """Return the closed loop of K subsystems: r_g = Σ_h W_gh s_h, each packet with its age at arrival."""
-    maps = [peer_class.lifted for peer_class in loop.subsystems]
+    maps = [peer_class.lifted for peer_class in loop.peer_classes]
     layout = lay_out_loop(loop)
     closed = interconnect(maps, feedback_of(loop, layout), layout, numbers=MIDPOINT_RADIUS)
     return ClosedLoop(
         name=loop.name,
         multiplicity=loop.multiplicity,
-        subsystems=loop.subsystems,
+        peer_classes=loop.peer_classes,
         coupling=loop.coupling,
-        frame_s=float(loop.subsystems[0].schedule.frame_s),
+        frame_s=float(loop.peer_classes[0].schedule.frame_s),
         layout=layout,
         matrix=value_of(closed.matrix),
         error=error_radius(closed.matrix),
         received=tuple(map(value_of, closed.received)),
         motion=tuple(
             offset + index
-            for peer_class, offset in zip(loop.subsystems, layout.offsets, strict=True)
+            for peer_class, offset in zip(loop.peer_classes, layout.offsets, strict=True)
             for index in range(len(peer_class.subsystem.peer_type.states))
         ),
         weight_errors=loop.weight_errors,
@@ -253,14 +256,14 @@ def bounded_weight(weight: Fraction, weight_error: float) -> tuple[float, float]
 def feedback_of(loop: ModalSystem | ClosedLoop, layout: StateLayout) -> list[InterconnectionMatrices]:
     """Return the interconnection matrices, each weight with the radius of its error and rounding."""
     row_of = [
-        {sent: row for row, sent in enumerate(peer_class.schedule.sent)} for peer_class in loop.subsystems
+        {sent: row for row, sent in enumerate(peer_class.schedule.sent)} for peer_class in loop.peer_classes
     ]
-    starts = np.cumsum([0] + [len(peer_class.schedule.sent) for peer_class in loop.subsystems]).tolist()
+    starts = np.cumsum([0] + [len(peer_class.schedule.sent) for peer_class in loop.peer_classes]).tolist()
     # Few weights at many indices: each is converted once, and plain keys are found faster than packets.
     indices = {(packet.subsystem, packet.row, packet.lag): index for packet, index in layout.indices.items()}
     converted: dict[tuple[int, int, float], tuple[float, float]] = {}
     feedbacks = []
-    for g, peer_class in enumerate(loop.subsystems):
+    for g, peer_class in enumerate(loop.peer_classes):
         direct = np.zeros((2, len(peer_class.schedule.received), starts[-1]))
         delayed = np.zeros((2, len(peer_class.schedule.received), len(layout.names)))
         for input_row, received in enumerate(peer_class.schedule.received):

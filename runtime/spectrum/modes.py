@@ -60,12 +60,12 @@ class ModalDecomposition:
     notes: tuple[str, ...]
 
 
-def split(groups: Sequence[PeerClass], comm_graph: CommunicationGraph) -> tuple[ClosedLoop, ...]:
+def split(peer_classes: Sequence[PeerClass], comm_graph: CommunicationGraph) -> tuple[ClosedLoop, ...]:
     """Return the complete system as the smallest closed loops that its graphs and groups allow.
 
     Parameters
     ----------
-    groups
+    peer_classes
         All peers (see `peer_classes.classes_of_peers`).
     comm_graph
         The links.
@@ -75,37 +75,41 @@ def split(groups: Sequence[PeerClass], comm_graph: CommunicationGraph) -> tuple[
     ApcError
         E801, E802 an undefined mean; E804 one system of too many states.
     """
-    loops = decompose(groups, comm_graph).loops
+    loops = decompose(peer_classes, comm_graph).loops
     for modal_system in loops:
         if modal_system.states > MATRIX_STATES:
             raise too_large(comm_graph, f"{comm_graph.peers:,} peers", modal_system.states)
     return tuple(close_loop(modal_system) for modal_system in loops)
 
 
-def decompose(groups: Sequence[PeerClass], comm_graph: CommunicationGraph) -> ModalDecomposition:
+def decompose(peer_classes: Sequence[PeerClass], comm_graph: CommunicationGraph) -> ModalDecomposition:
     """Return the independent loops of a complete system, before their matrices are built (see `split`).
 
     Parameters
     ----------
-    groups, comm_graph
+    peer_classes, comm_graph
         As for `split`.
     """
-    coupling_terms = used_coupling_terms(peer_class.schedule for peer_class in groups)
-    graphs = incomplete_links((peer_class.schedule for peer_class in groups), comm_graph)
+    coupling_terms = used_coupling_terms(peer_class.schedule for peer_class in peer_classes)
+    graphs = incomplete_links((peer_class.schedule for peer_class in peer_classes), comm_graph)
     if not graphs:
-        return ModalDecomposition("modes", complete_loops(groups, comm_graph), ())
+        return ModalDecomposition("modes", complete_loops(peer_classes, comm_graph), ())
     named = " and ".join(f"{link} ({comm_graph.links[link].graph.shape})" for link in graphs)
-    reason = f"the peers on {named} differ" if len(groups) > 1 else common_graph(coupling_terms, comm_graph)
+    reason = (
+        f"the peers on {named} differ" if len(peer_classes) > 1 else common_graph(coupling_terms, comm_graph)
+    )
     if not reason:
-        scale = graph_scale(groups[0], coupling_terms, comm_graph)
+        scale = graph_scale(peer_classes[0], coupling_terms, comm_graph)
         modes = graph_modes(comm_graph.links[graphs[0]].graph, comm_graph.peers, mean=scale.by_mean)
         if modes is not None:
             note = f"{len(modes)} subsystems, one for each eigenvalue of the graph of {named}"
             return ModalDecomposition(
-                "modes", tuple(graph_loop(groups[0], graph_mode, scale) for graph_mode in modes), (note,)
+                "modes",
+                tuple(graph_loop(peer_classes[0], graph_mode, scale) for graph_mode in modes),
+                (note,),
             )
         reason = f"the graph of {named} has no full set of eigenvectors"
-    parts = split_exchangeable(dense_loop(groups, comm_graph), comm_graph)
+    parts = split_exchangeable(dense_loop(peer_classes, comm_graph), comm_graph)
     if len(parts) > 1:
         note = f"{len(parts)} subsystems (common and difference motions of interchangeable peers)"
         return ModalDecomposition("modes", parts, (note,))
@@ -113,7 +117,7 @@ def decompose(groups: Sequence[PeerClass], comm_graph: CommunicationGraph) -> Mo
 
 
 def accepted_loops(
-    groups: Sequence[PeerClass],
+    peer_classes: Sequence[PeerClass],
     comm_graph: CommunicationGraph,
     accepted: Callable[[tuple[ModalSystem, ...]], bool],
     subject: str,
@@ -122,7 +126,7 @@ def accepted_loops(
 
     Parameters
     ----------
-    groups, comm_graph
+    peer_classes, comm_graph
         As for `split`.
     accepted
         Whether a question can be answered from these loops.
@@ -134,27 +138,27 @@ def accepted_loops(
     ApcError
         E933 one loop of too many states.
     """
-    decomposed = decompose(groups, comm_graph)
+    decomposed = decompose(peer_classes, comm_graph)
     if decomposed.method == "modes" and accepted(decomposed.loops):
         return decomposed.loops, True
     states = sum(
-        peer_class.count * states_of(peer_class.schedule, peer_class.jacobians) for peer_class in groups
+        peer_class.count * states_of(peer_class.schedule, peer_class.jacobians) for peer_class in peer_classes
     )
     if states > MATRIX_STATES:
         message = f"{subject}: {comm_graph.peers:,} peers on this graph form one system of {states:,} states"
         advice = f"use equal peers on complete graphs, or at most {MATRIX_STATES:,} states in total"
         raise ApcError(Diagnostic("E933", SourceLocation(comm_graph.topology), message, advice=advice))
-    return (dense_loop(groups, comm_graph),), False
+    return (dense_loop(peer_classes, comm_graph),), False
 
 
 def orthogonal_loops(
-    groups: Sequence[PeerClass], comm_graph: CommunicationGraph, most: int
+    peer_classes: Sequence[PeerClass], comm_graph: CommunicationGraph, most: int
 ) -> tuple[ModalSystem, ...]:
     """Return a model as orthogonal loops, the common loop first.
 
     Parameters
     ----------
-    groups, comm_graph
+    peer_classes, comm_graph
         As for `split`.
     most
         The limit of peers on a graph that is not complete.
@@ -164,57 +168,59 @@ def orthogonal_loops(
     NotSupportedError
         More peers on such a graph than the limit.
     """
-    graphs = incomplete_links((peer_class.schedule for peer_class in groups), comm_graph)
+    graphs = incomplete_links((peer_class.schedule for peer_class in peer_classes), comm_graph)
     if not graphs:
-        return complete_loops(groups, comm_graph)
-    count = sum(peer_class.count for peer_class in groups)
+        return complete_loops(peer_classes, comm_graph)
+    count = sum(peer_class.count for peer_class in peer_classes)
     if count > most:
         raise NotSupportedError(f"{count:,} peers on a graph that is not complete; the limit is {most}")
-    if len(groups) == 1 and all(comm_graph.links[link].graph.shape == "ring" for link in graphs):
-        arrangement = decompose(groups, comm_graph)
+    if len(peer_classes) == 1 and all(comm_graph.links[link].graph.shape == "ring" for link in graphs):
+        arrangement = decompose(peer_classes, comm_graph)
         if arrangement.method == "modes":
             return arrangement.loops
-    return split_exchangeable(dense_loop(groups, comm_graph), comm_graph)
+    return split_exchangeable(dense_loop(peer_classes, comm_graph), comm_graph)
 
 
-def complete_loops(groups: Sequence[PeerClass], comm_graph: CommunicationGraph) -> tuple[ModalSystem, ...]:
+def complete_loops(
+    peer_classes: Sequence[PeerClass], comm_graph: CommunicationGraph
+) -> tuple[ModalSystem, ...]:
     """Return a common loop, and a difference loop for each group of two or more peers, on complete graphs.
 
     Parameters
     ----------
-    groups
+    peer_classes
         All peers (see `peer_classes.classes_of_peers`).
     comm_graph
         The links, all of them complete.
     """
-    degrees = complete_degrees(groups, comm_graph)
+    degrees = complete_degrees(peer_classes, comm_graph)
     weights = couple(
-        groups,
+        peer_classes,
         comm_graph,
-        lambda coupling_term, g, h: Fraction(groups[h].count - (1 if g == h else 0)),
+        lambda coupling_term, g, h: Fraction(peer_classes[h].count - (1 if g == h else 0)),
         degrees,
     )
-    loops = [ModalSystem(_mode_family(groups), 1, tuple(groups), weights)]
-    if all(peer_class.count < 2 for peer_class in groups):
+    loops = [ModalSystem(_mode_family(peer_classes), 1, tuple(peer_classes), weights)]
+    if all(peer_class.count < 2 for peer_class in peer_classes):
         return tuple(loops)
     separation = couple(
-        groups, comm_graph, lambda coupling_term, g, h: Fraction(-1 if g == h else 0), degrees
+        peer_classes, comm_graph, lambda coupling_term, g, h: Fraction(-1 if g == h else 0), degrees
     )
-    for index, peer_class in enumerate(groups):
+    for index, peer_class in enumerate(peer_classes):
         if peer_class.count < 2:
             continue
         own_weights = {key: ((rows[index][index],),) for key, rows in separation.items()}
-        name = "difference" if len(groups) == 1 else f"difference {peer_class.name}"
+        name = "difference" if len(peer_classes) == 1 else f"difference {peer_class.name}"
         loops.append(ModalSystem(name, peer_class.count - 1, (peer_class,), own_weights))
     return tuple(loops)
 
 
-def dense(groups: Sequence[PeerClass], comm_graph: CommunicationGraph) -> ClosedLoop:
+def dense(peer_classes: Sequence[PeerClass], comm_graph: CommunicationGraph) -> ClosedLoop:
     """Return the closed loop of all peers of the system, as a reference; its cost is N³.
 
     Parameters
     ----------
-    groups
+    peer_classes
         All peers (see `peer_classes.classes_of_peers`).
     comm_graph
         The links.
@@ -224,27 +230,27 @@ def dense(groups: Sequence[PeerClass], comm_graph: CommunicationGraph) -> Closed
     ApcError
         E801, E802 an undefined mean; E804 more than `MATRIX_STATES` states.
     """
-    refuse_dense(groups, comm_graph)
-    return close_loop(dense_loop(groups, comm_graph))
+    refuse_dense(peer_classes, comm_graph)
+    return close_loop(dense_loop(peer_classes, comm_graph))
 
 
-def refuse_dense(groups: Sequence[PeerClass], comm_graph: CommunicationGraph) -> None:
+def refuse_dense(peer_classes: Sequence[PeerClass], comm_graph: CommunicationGraph) -> None:
     """Raise ApcError E804 for a dense system with too many states, before any peer is evaluated."""
     states = sum(
-        peer_class.count * states_of(peer_class.schedule, peer_class.jacobians) for peer_class in groups
+        peer_class.count * states_of(peer_class.schedule, peer_class.jacobians) for peer_class in peer_classes
     )
     if states > MATRIX_STATES:
         raise too_large(comm_graph, f"{comm_graph.peers:,} peers", states)
 
 
-def dense_loop(groups: Sequence[PeerClass], comm_graph: CommunicationGraph) -> ModalSystem:
+def dense_loop(peer_classes: Sequence[PeerClass], comm_graph: CommunicationGraph) -> ModalSystem:
     """Return all peers of the system as one loop, one subsystem per peer."""
     all_peers = tuple(
         replace(
             peer_class, name=comm_graph.peer_name(peer), count=1, peers=PeerIndices((range(peer, peer + 1),))
         )
         for peer, peer_class in sorted(
-            ((peer, peer_class) for peer_class in groups for peer in peer_class.peers),
+            ((peer, peer_class) for peer_class in peer_classes for peer in peer_class.peers),
             key=lambda pair: pair[0],
         )
     )
@@ -271,11 +277,11 @@ def dense_loop(groups: Sequence[PeerClass], comm_graph: CommunicationGraph) -> M
     return ModalSystem(COUPLED, 1, all_peers, coupling)
 
 
-def _mode_family(subsystems: Sequence[PeerClass]) -> str:
+def _mode_family(peer_classes: Sequence[PeerClass]) -> str:
     """Return the mode family: "single" for one peer, "common" for equal peers, "coupled" for
     different peers.
     """
-    return COUPLED if len(subsystems) > 1 else "common" if subsystems[0].count > 1 else "single"
+    return COUPLED if len(peer_classes) > 1 else "common" if peer_classes[0].count > 1 else "single"
 
 
 def split_exchangeable(modal_system: ModalSystem, comm_graph: CommunicationGraph) -> tuple[ModalSystem, ...]:
@@ -290,7 +296,7 @@ def split_exchangeable(modal_system: ModalSystem, comm_graph: CommunicationGraph
         The links, for the names of the groups.
     """
     classes: list[list[int]] = []
-    for index in range(len(modal_system.subsystems)):
+    for index in range(len(modal_system.peer_classes)):
         interchangeable = (
             members for members in classes if _are_exchangeable(modal_system, members[0], index)
         )
@@ -299,10 +305,10 @@ def split_exchangeable(modal_system: ModalSystem, comm_graph: CommunicationGraph
             classes.append([index])
         else:
             matching_class.append(index)
-    if modal_system.weight_errors or len(classes) == len(modal_system.subsystems):
+    if modal_system.weight_errors or len(classes) == len(modal_system.peer_classes):
         return (modal_system,)
-    subsystems = tuple(
-        _merged_class([modal_system.subsystems[index] for index in members], comm_graph)
+    peer_classes = tuple(
+        _merged_class([modal_system.peer_classes[index] for index in members], comm_graph)
         for members in classes
     )
     coupling = {
@@ -312,8 +318,10 @@ def split_exchangeable(modal_system: ModalSystem, comm_graph: CommunicationGraph
         )
         for coupling_term in modal_system.coupling
     }
-    loops = [replace(modal_system, name=_mode_family(subsystems), subsystems=subsystems, coupling=coupling)]
-    for peer_class, members in zip(subsystems, classes, strict=True):
+    loops = [
+        replace(modal_system, name=_mode_family(peer_classes), peer_classes=peer_classes, coupling=coupling)
+    ]
+    for peer_class, members in zip(peer_classes, classes, strict=True):
         if len(members) > 1:
             first, second = members[:2]
             separation = {
@@ -329,10 +337,10 @@ def split_exchangeable(modal_system: ModalSystem, comm_graph: CommunicationGraph
 
 def _are_exchangeable(modal_system: ModalSystem, g: int, h: int) -> bool:
     """Return whether an exchange of the subsystems g and h leaves the loop unchanged."""
-    peer_class, other = modal_system.subsystems[g], modal_system.subsystems[h]
+    peer_class, other = modal_system.peer_classes[g], modal_system.peer_classes[h]
     if peer_class.index != other.index:
         return False
-    remaining = [index for index in range(len(modal_system.subsystems)) if index not in (g, h)]
+    remaining = [index for index in range(len(modal_system.peer_classes)) if index not in (g, h)]
     return all(
         rows[g][g] == rows[h][h]
         and rows[g][h] == rows[h][g]
@@ -353,14 +361,14 @@ def _class_weight(
     return sum((row[index] for index in senders), Fraction(0))
 
 
-def _merged_class(subsystems: Sequence[PeerClass], comm_graph: CommunicationGraph) -> PeerClass:
+def _merged_class(peer_classes: Sequence[PeerClass], comm_graph: CommunicationGraph) -> PeerClass:
     """Return equal subsystems as one class of peers."""
-    peers = PeerIndices(tuple(run for peer_class in subsystems for run in peer_class.peers.runs))
-    return replace(subsystems[0], name=group_name(peers, comm_graph), count=len(peers), peers=peers)
+    peers = PeerIndices(tuple(run for peer_class in peer_classes for run in peer_class.peers.runs))
+    return replace(peer_classes[0], name=group_name(peers, comm_graph), count=len(peers), peers=peers)
 
 
 def couple(
-    groups: Sequence[PeerClass],
+    peer_classes: Sequence[PeerClass],
     comm_graph: CommunicationGraph,
     weigh: Callable[[CouplingTerm, int, int], Fraction],
     degrees: Mapping[tuple[str, int], Fraction],
@@ -369,7 +377,7 @@ def couple(
 
     Parameters
     ----------
-    groups
+    peer_classes
         The subsystems.
     comm_graph
         The links.
@@ -379,9 +387,9 @@ def couple(
         The divisors of a mean, by link and subsystem, without entries for peers that receive nothing.
     """
     coupling = {}
-    for coupling_term in used_coupling_terms(peer_class.schedule for peer_class in groups):
+    for coupling_term in used_coupling_terms(peer_class.schedule for peer_class in peer_classes):
         rows = []
-        for g, peer_class in enumerate(groups):
+        for g, peer_class in enumerate(peer_classes):
             receives = any(
                 received.coupling_term == coupling_term for received in peer_class.schedule.received
             )
@@ -396,7 +404,7 @@ def couple(
                     total or Fraction(0),
                 )
             row = []
-            for h, sender in enumerate(groups):
+            for h, sender in enumerate(peer_classes):
                 weight = (
                     weigh(coupling_term, g, h)
                     if receives and sender.sends(coupling_term.link)
@@ -422,13 +430,13 @@ def couple(
 
 
 def complete_degrees(
-    groups: Sequence[PeerClass], comm_graph: CommunicationGraph
+    peer_classes: Sequence[PeerClass], comm_graph: CommunicationGraph
 ) -> dict[tuple[str, int], Fraction]:
     """Return the number of other peers from which a peer of each group receives, for each complete link."""
     degrees = {}
     for link in comm_graph.links:
-        total = sum(peer_class.count for peer_class in groups if peer_class.sends(link))
-        for g, peer_class in enumerate(groups):
+        total = sum(peer_class.count for peer_class in peer_classes if peer_class.sends(link))
+        for g, peer_class in enumerate(peer_classes):
             number = total - (1 if peer_class.sends(link) else 0)
             if number:
                 degrees[link, g] = Fraction(number)

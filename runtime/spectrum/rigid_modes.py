@@ -127,10 +127,10 @@ def classify_neutral_modes(system: ClosedLoop | ModalSystem, *, with_drifts: boo
         Whether to search for drifts, which is most of the work.
     """
     vectors = [state for _, state in _neutral_solutions(system)]
-    angle_indices = _indices(system.subsystems, ANGLES)
+    angle_indices = _indices(system.peer_classes, ANGLES)
     position_indices = [
         *angle_indices,
-        *_indices(system.subsystems, (LENGTH,)),
+        *_indices(system.peer_classes, (LENGTH,)),
     ]  # a mode that shifts an angle is a rotation
     ramps = []
     for weights, state in _drifts(system, vectors) if with_drifts else []:
@@ -180,11 +180,11 @@ def _shifted_names(names: Sequence[str], vector: Sequence[Fraction]) -> str:
     return f"the common shift of {', '.join([*listed[:MOST_NAMED], *more])}"
 
 
-def _indices(subsystems: Sequence[PeerClass], units: Sequence[str]) -> list[int]:
+def _indices(peer_classes: Sequence[PeerClass], units: Sequence[str]) -> list[int]:
     """Return the indices of continuous states with one of the given units."""
     indices, start = [], 0
-    sizes = [states_of(peer_class.schedule, peer_class.jacobians) for peer_class in subsystems]
-    for peer_class, size in zip(subsystems, sizes, strict=True):
+    sizes = [states_of(peer_class.schedule, peer_class.jacobians) for peer_class in peer_classes]
+    for peer_class, size in zip(peer_classes, sizes, strict=True):
         states = peer_class.jacobians.peer_type.states
         indices += [start + index for index, state in enumerate(states) if state.unit in units]
         start += size
@@ -225,7 +225,7 @@ def _neutral_solutions(system: ClosedLoop | ModalSystem) -> list[tuple[list[Frac
     An output that is not used may be free without being part of the state.
     """
     equations, states = _constant_solution_equations(
-        system, [peer_class.exact for peer_class in system.subsystems]
+        system, [peer_class.exact for peer_class in system.peer_classes]
     )
     pairs: list[tuple[list[Fraction], list[Fraction]]] = []
     for solution in null_space(equations):
@@ -286,7 +286,7 @@ def _constant_solution_equations(
     equations, states = [np.zeros((0, size), dtype=object)], [np.zeros((0, size), dtype=object)]
     unit = np.eye(size, dtype=np.int64).astype(object)
     for g, (peer_class, subsystem, output, (x, u)) in enumerate(
-        zip(system.subsystems, subsystems, outputs, indices, strict=True)
+        zip(system.peer_classes, subsystems, outputs, indices, strict=True)
     ):
         equations.append(_over_unknowns(size, len(x), (x, subsystem.a), (u, subsystem.b)))
         for p, (tick, partition) in enumerate(zip(subsystem.ticks, subsystem.peer_type.clocks, strict=True)):
@@ -406,7 +406,7 @@ def _ramp_equations(
     """
     states = np.array([[number(entry) for entry in state] for state in neutral], dtype=object).T
     rates, z = BALLS.multiply(states, unknowns[: len(neutral)]), unknowns[len(neutral) :]
-    subsystems = [entrywise(peer_class.exact, number) for peer_class in system.subsystems]
+    subsystems = [entrywise(peer_class.exact, number) for peer_class in system.peer_classes]
     rates_of = [
         rates[offset : offset + len(subsystem.a)]
         for subsystem, offset in zip(subsystems, system.layout.offsets, strict=True)
@@ -428,10 +428,10 @@ def _ramp_equations(
     }
     steps = [
         frame_steps(subsystem, peer_class.schedule, euler)
-        for subsystem, peer_class in zip(subsystems, system.subsystems, strict=True)
+        for subsystem, peer_class in zip(subsystems, system.peer_classes, strict=True)
     ]
     end_state = closed_frame(system, subsystems, steps, weights=weights, state=z, watch=watch)
-    equations.append(end_state - z - rates * number(system.subsystems[0].schedule.frame_s))
+    equations.append(end_state - z - rates * number(system.peer_classes[0].schedule.frame_s))
     equations += [
         BALLS.multiply(subsystem.a, values) for subsystem, values in zip(subsystems, rates_of, strict=True)
     ]

@@ -273,7 +273,7 @@ def _largest_component(closed_loop: ClosedLoop) -> int:
 def _exact_work(closed_loop: ClosedLoop) -> int:
     """Return the number of states times the number of events of a frame."""
     return len(closed_loop.matrix) * sum(
-        len(peer_class.schedule.events) for peer_class in closed_loop.subsystems
+        len(peer_class.schedule.events) for peer_class in closed_loop.peer_classes
     )
 
 
@@ -433,9 +433,9 @@ def _motions_of_rows(closed_loop: ClosedLoop, solved: _SolvedLoop, rows: Integer
 
 def _has_discrete_updates(closed_loop: ClosedLoop) -> bool:
     """Return whether any discrete update, besides the exact exponential, forms the frame's map."""
-    return not closed_loop.subsystems or any(
+    return not closed_loop.peer_classes or any(
         not isinstance(event, Propagate)
-        for peer_class in closed_loop.subsystems
+        for peer_class in closed_loop.peer_classes
         for event in peer_class.schedule.events
     )
 
@@ -522,11 +522,11 @@ def angles_in_frame(closed_loop: ClosedLoop, values: Complexes, vectors: Complex
     alternative = own_states[np.argmax(shares[own_states], axis=0)]
     dominant = np.where(shares[dominant, mode_numbers] > LEAST_SHARE, dominant, alternative)
     moving = shares[dominant, mode_numbers] > LEAST_SHARE
-    if not closed_loop.subsystems:
+    if not closed_loop.peer_classes:
         return np.where(moving, np.nan, angles)
     subsystem_of = np.searchsorted(closed_loop.offsets, dominant, side="right") - 1
     for g, (peer_class, offset, received) in enumerate(
-        zip(closed_loop.subsystems, closed_loop.offsets, closed_loop.received, strict=True)
+        zip(closed_loop.peer_classes, closed_loop.offsets, closed_loop.received, strict=True)
     ):
         mode_indices = np.flatnonzero(moving & (subsystem_of == g))
         if len(mode_indices):

@@ -46,12 +46,12 @@ def count_translations(numeric: NumericModel, populations: Sequence[Heterogeneou
     populations
         The peers of the model, by group.
     """
-    groups = representatives(numeric)
+    peer_classes = representatives(numeric)
     total = 0
-    for modal_system in complete_loops(groups, numeric.comm_graph):
+    for modal_system in complete_loops(peer_classes, numeric.comm_graph):
         free = len(find_rigid_modes(modal_system, with_drifts=False).names)
         if free and not are_common_to_all_peers(
-            modal_system, [populations[peer_class.index] for peer_class in modal_system.subsystems]
+            modal_system, [populations[peer_class.index] for peer_class in modal_system.peer_classes]
         ):
             return None
         total += modal_system.multiplicity * free
@@ -72,7 +72,7 @@ def are_common_to_all_peers(modal_system: ModalSystem, populations: Sequence[Het
         if not (population.parameters != population.parameters[0]).any():
             continue  # every represented peer equals its representative
         subsystems: list[LinearSubsystem | None] = [
-            peer_class.exact for peer_class in modal_system.subsystems
+            peer_class.exact for peer_class in modal_system.peer_classes
         ]
         subsystems[index] = _random_peer(population)
         linear_subsystems = [subsystem for subsystem in subsystems if subsystem is not None]

@@ -379,7 +379,9 @@ def _shared_matrices(
                 return None
             if max(modal_system.states for modal_system in plan.loops) > BATCH_STATES:
                 return None
-            evaluator = batch_evaluator(timed_system, parameter_refs, plan.groups, generic_model.comm_graph)
+            evaluator = batch_evaluator(
+                timed_system, parameter_refs, plan.peer_classes, generic_model.comm_graph
+            )
     except ApcError:
         return None  # each point reports its own error
     rigid = drifts = 0

@@ -296,9 +296,9 @@ def _segment(
             durations[quanta] = (float(quanta * schedule.quantum - slope * delay), float(slope))
     if not follows and not any(slope for _, slope in durations.values()):
         return DelaySegment(low, high, None, inside.model)
-    groups, comm_graph = lifted_classes(inside)
+    peer_classes, comm_graph = lifted_classes(inside)
     evaluator = batch_evaluator(
-        inside.model, (parameter_ref,), groups, comm_graph, durations=durations, follows=follows
+        inside.model, (parameter_ref,), peer_classes, comm_graph, durations=durations, follows=follows
     )
     return DelaySegment(low, high, evaluator, inside.model)
 

@@ -235,7 +235,7 @@ def _angles(
     largest_state = motion[participations[:, motion].argmax(axis=1)]
     moves = participations[np.arange(count), largest_state] > LEAST_SHARE * participations.sum(axis=1)
     subsystem_of = np.searchsorted(closed_loop.offsets, largest_state, side="right") - 1
-    for g, (peer_class, offset) in enumerate(zip(closed_loop.subsystems, closed_loop.offsets, strict=True)):
+    for g, (peer_class, offset) in enumerate(zip(closed_loop.peer_classes, closed_loop.offsets, strict=True)):
         indices = np.flatnonzero(moves & (subsystem_of == g))
         if not len(indices):
             continue

@@ -134,7 +134,7 @@ class BatchEvaluator:
     model: Model
     free: tuple[ParameterRef, ...]
     comm_graph: CommunicationGraph
-    groups: tuple[PeerClass, ...]
+    peer_classes: tuple[PeerClass, ...]
     wirings: tuple[LoopStructure, ...]
     durations: Mapping[int, tuple[float, float]]
     tangents: Mapping[str, Any]  # casadi.Function by the peer type's name
@@ -203,7 +203,7 @@ class BatchEvaluator:
 
         If the parameter is a time, only step durations change.
         """
-        used = {peer_class.index for closed_loop in systems for peer_class in closed_loop.subsystems}
+        used = {peer_class.index for closed_loop in systems for peer_class in closed_loop.peer_classes}
         at_value = {
             peer_class.index: (vector, linearize_exact(peer_class.jacobians, peer_class.exact_at(vector)))
             for peer_class, vector in self._parameters_at(value)
@@ -217,19 +217,19 @@ class BatchEvaluator:
             return replace(peer_class, parameters=vector, exact_parameters=numbers, exact=exact)
 
         return tuple(
-            replace(closed_loop, subsystems=tuple(map(at_point, closed_loop.subsystems)))
+            replace(closed_loop, peer_classes=tuple(map(at_point, closed_loop.peer_classes)))
             for closed_loop in systems
         )
 
     def _parameters_at(self, value: Sequence[float]) -> list[tuple[PeerClass, Floats]]:
         """Return each class with its parameters at one point (m,)."""
         point = np.array([value], dtype=np.float64)
-        return [(peer_class, self.vectors(peer_class, point)[0]) for peer_class in self.groups]
+        return [(peer_class, self.vectors(peer_class, point)[0]) for peer_class in self.peer_classes]
 
     def lifted(self, values: Matrices) -> dict[int, FrameMap]:
         """Return the frame maps of all classes by their indices."""
         result: dict[int, FrameMap] = {}
-        for peer_class in self.groups:
+        for peer_class in self.peer_classes:
             if peer_class.index not in result:
                 result[peer_class.index] = self._lift(peer_class, values)
         return result
@@ -244,14 +244,14 @@ class BatchEvaluator:
         """
         assert not self.timed, "the errors of a step belong to its time"
         lifts: dict[int, tuple[LinearSubsystem, FrameMap]] = {}
-        for peer_class in self.groups:
+        for peer_class in self.peer_classes:
             if peer_class.index not in lifts:
                 lifts[peer_class.index] = self._lift_bounded(peer_class, vectors(peer_class))
         bounded_systems = []
         for wiring in self.wirings:
             closed_loop = wiring.closed_loop
             subsystems, maps = zip(
-                *(lifts[peer_class.index] for peer_class in closed_loop.subsystems), strict=True
+                *(lifts[peer_class.index] for peer_class in closed_loop.peer_classes), strict=True
             )
             closed = interconnect(maps, wiring.feedback, closed_loop.layout, numbers=MIDPOINT_RADIUS)
             complete = value_of(closed.matrix)
@@ -348,7 +348,7 @@ class BatchEvaluator:
 def batch_evaluator(
     model: Model,
     parameter_refs: Sequence[ParameterRef],
-    groups: Sequence[PeerClass],
+    peer_classes: Sequence[PeerClass],
     comm_graph: CommunicationGraph,
     *,
     durations: Mapping[int, tuple[float, float]] | None = None,
@@ -363,7 +363,7 @@ def batch_evaluator(
         The compiled model.
     parameter_refs
         The parameters that vary.
-    groups, comm_graph
+    peer_classes, comm_graph
         The model's peers at a generic point, from `analysis.lifted_classes`.
     durations
         For a time that varies: the seconds of each step by its quanta, as constant and slope.
@@ -372,16 +372,16 @@ def batch_evaluator(
     matrices
         Whether the systems' matrices are required, or only the maps of the subsystems.
     """
-    systems = split(groups, comm_graph) if matrices else ()
+    systems = split(peer_classes, comm_graph) if matrices else ()
     if durations is None:
         durations = {
             event.duration: (float(event.duration * peer_class.schedule.quantum), 0.0)
-            for peer_class in groups
+            for peer_class in peer_classes
             for event in peer_class.schedule.events
             if isinstance(event, Propagate)
         }
     tangents = (
-        {peer_class.jacobians.peer_type.name: _tangent(peer_class.jacobians) for peer_class in groups}
+        {peer_class.jacobians.peer_type.name: _tangent(peer_class.jacobians) for peer_class in peer_classes}
         if follows
         else {}
     )
@@ -389,7 +389,7 @@ def batch_evaluator(
         model=model,
         free=tuple(parameter_refs),
         comm_graph=comm_graph,
-        groups=tuple(groups),
+        peer_classes=tuple(peer_classes),
         wirings=tuple(loop_structure(closed_system) for closed_system in systems),
         durations=durations,
         tangents=tangents,
@@ -432,7 +432,7 @@ def _constant_exponentials(evaluator: BatchEvaluator) -> dict[int, Mapping[int, 
         return {}
     result: dict[int, Mapping[int, Matrices]] = {}
     point, along = _generic_point(len(evaluator.free))
-    for peer_class in evaluator.groups:
+    for peer_class in evaluator.peer_classes:
         if peer_class.index in result:
             continue
         vectors = evaluator.vectors(peer_class, point + (STEP * 1j) * along)
@@ -457,7 +457,8 @@ def lifted_systems(systems: Sequence[Wired]) -> tuple[Wired, ...]:
         return replace(peer_class, subsystem=subsystem).with_lifted(frame)
 
     return tuple(
-        replace(closed_loop, subsystems=tuple(map(lifted, closed_loop.subsystems))) for closed_loop in systems
+        replace(closed_loop, peer_classes=tuple(map(lifted, closed_loop.peer_classes)))
+        for closed_loop in systems
     )
 
 

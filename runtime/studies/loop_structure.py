@@ -103,7 +103,7 @@ def with_constant_pivots(wiring: LoopStructure, rigid_elsewhere: RigidModes) -> 
 
 def closed_loop(wiring: LoopStructure, lifted: Mapping[int, FrameMap]) -> Matrices:
     """Return the closed-loop matrices (k, n, n) of one system at all points."""
-    maps = [lifted[peer_class.index] for peer_class in wiring.closed_loop.subsystems]
+    maps = [lifted[peer_class.index] for peer_class in wiring.closed_loop.peer_classes]
     return interconnect(
         maps, [feedback.plain for feedback in wiring.feedback], wiring.closed_loop.layout
     ).matrix

@@ -111,7 +111,7 @@ class MomentEvaluator(RadiusEvaluator):
         """Return the second-moment operator at each value (k, m), over a cell along a given direction."""
         assert self.lifts is not None and self.classes is not None
         lifted = self.lifts.lifted(values if along is None else values + (STEP * 1j) * along)
-        names = {peer_class.name: peer_class.index for peer_class in self.classes.common.subsystems}
+        names = {peer_class.name: peer_class.index for peer_class in self.classes.common.peer_classes}
 
         def at_point(block: NDArray[np.complex128], k: int) -> Floats:
             """Return a matrix at one point with its error radius, and its derivative (2 or 3, n, n)."""
@@ -172,5 +172,7 @@ def moment_evaluator(
         or not all(np.array_equal(one.neutral, other.neutral) for one, other in neutral)
     ):
         return plain
-    lifts = batch_evaluator(generic_point.model, refs, reception.groups, reception.comm_graph, matrices=False)
+    lifts = batch_evaluator(
+        generic_point.model, refs, reception.peer_classes, reception.comm_graph, matrices=False
+    )
     return MomentEvaluator(numeric, refs, location, MEAN_SQUARE, lifts, classes, memories, present)

@@ -76,10 +76,10 @@ def at(comp: float, comm: float, phase: float = 0, first: float = 0, own: bool =
 
 def check(topology: TopologySource) -> None:
     """Compare the split and the dense spectrum of a topology's text with that of peers stepped one by one."""
-    groups, comm_graph = lifted_classes(numeric_model(compiled(text_of(topology))))
-    systems = split(groups, comm_graph)
+    peer_classes, comm_graph = lifted_classes(numeric_model(compiled(text_of(topology))))
+    systems = split(peer_classes, comm_graph)
     modes = np.concatenate([np.repeat(np.linalg.eigvals(one.matrix), one.multiplicity) for one in systems])
-    whole = np.linalg.eigvals(dense(groups, comm_graph).matrix)
+    whole = np.linalg.eigvals(dense(peer_classes, comm_graph).matrix)
     expected = np.linalg.eigvals(np.array(frame_matrix(topology)))
     largest = max(1.0, float(np.abs(expected).max()))
     for found in (modes, whole):

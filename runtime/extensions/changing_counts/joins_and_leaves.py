@@ -246,11 +246,11 @@ def _matrices(
         changed = numeric.at(apply(numeric.model, [Override(parameter_ref, Fraction(count))]))
         if sides(changed)[0].numeric is not changed:
             raise _not_interchangeable(f"with {count} peers the start is at a kink")
-        groups, comm_graph = lifted_classes(changed)
+        peer_classes, comm_graph = lifted_classes(changed)
         complete = all(map(comm_graph.is_complete, comm_graph.links))
-        if not complete or decompose(groups, comm_graph).method != "modes":
+        if not complete or decompose(peer_classes, comm_graph).method != "modes":
             raise _not_interchangeable("the peers are not interchangeable")
-        for closed in split(groups, comm_graph):
+        for closed in split(peer_classes, comm_graph):
             structure = loop_structure(closed)
             matrix = relative(
                 with_error_radius(closed.matrix, closed.error),

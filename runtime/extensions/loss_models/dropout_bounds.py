@@ -168,7 +168,7 @@ def _modes(numeric: NumericModel) -> tuple[list[LossMode], float]:
         link.name for link in model.links if len({channel.loss is None for channel in link.channels}) > 1
     ]:
         raise NotSupportedError(f"only some pairs of groups lose packets of {mixed[0]}")
-    loops = orthogonal_loops(reception.groups, reception.comm_graph, GAIN_BOUND_STATES)
+    loops = orthogonal_loops(reception.peer_classes, reception.comm_graph, GAIN_BOUND_STATES)
     lossy = frozenset(link.name for link in model.links if link.channel is not None)
     packets = Packets(model, reception)
     packet_numbers = {row: packets.received(row)[0] for row in packets.rows}
@@ -177,12 +177,12 @@ def _modes(numeric: NumericModel) -> tuple[list[LossMode], float]:
     previous_packets = {
         row: min(n, -1) if row.coupling_term.link in lossy else n for row, n in packet_numbers.items()
     }
-    ratios, (weight, sizes) = ratios_of(loops[0].subsystems, lossy), weight_of(loops, lossy)
+    ratios, (weight, sizes) = ratios_of(loops[0].peer_classes, lossy), weight_of(loops, lossy)
     modes = []
     for modal_system in loops:
         received_loop = packets.loop(modal_system, packet_numbers, depths)
         error_bound = []
-        for g, peer_class in enumerate(received_loop.subsystems):
+        for g, peer_class in enumerate(received_loop.peer_classes):
             reception_of = dict[
                 tuple[CouplingTerm, SentSample], dict[int, int]
             ]()  # all receivers of a packet have the same error
@@ -197,7 +197,7 @@ def _modes(numeric: NumericModel) -> tuple[list[LossMode], float]:
         response = change_of_sent(received_loop, error_bound, ratios, sizes)
         lost_loop = packets.loop(modal_system, previous_packets, depths)
         layout = lay_out_loop(lost_loop)
-        maps, n = [peer_class.lifted for peer_class in lost_loop.subsystems], len(layout.names)
+        maps, n = [peer_class.lifted for peer_class in lost_loop.peer_classes], len(layout.names)
         states = len(response.coordinates.eliminated) + len(response.coordinates.rest)
         matrix = np.zeros((2, states, states))
         matrix[:, :n, :n] = interconnect(
@@ -206,7 +206,7 @@ def _modes(numeric: NumericModel) -> tuple[list[LossMode], float]:
         for packet, index in layout.indices.items():
             if (
                 packet.lag == 1
-                and lost_loop.subsystems[packet.subsystem].schedule.sent[packet.row].link in lossy
+                and lost_loop.peer_classes[packet.subsystem].schedule.sent[packet.row].link in lossy
             ):
                 matrix[:, index] = 0.0
                 matrix[0, index, index] = 1.0

@@ -120,7 +120,7 @@ def hold_frame(model: Model, reception: PerTickReception, *, interchangeable: bo
     interchangeable
         Whether the peers are exchangeable.
     """
-    modal_system = dense_loop(reception.groups, reception.comm_graph)
+    modal_system = dense_loop(reception.peer_classes, reception.comm_graph)
     memories = stored_of(model, reception, modal_system)
     links = {link.name: link for link in model.links}
     received_channels, loss_channels, laws = list[ReceivedChannel](), list[LossChannel](), list[ChannelLaw]()
@@ -130,13 +130,13 @@ def hold_frame(model: Model, reception: PerTickReception, *, interchangeable: bo
             for coupling_term in modal_system.coupling
             if (coupling_term.link, coupling_term.delay) == memory.route
         ]
-        for g, h in itertools.product(range(len(modal_system.subsystems)), repeat=2):
+        for g, h in itertools.product(range(len(modal_system.peer_classes)), repeat=2):
             weights = {coupling_term: modal_system.coupling[coupling_term][g][h] for coupling_term in routes}
             if any(weights.values()):
                 received_channels.append(ReceivedChannel(g, memory.route, weights))
                 loss_channels.append((g, h, number))
                 laws.append(channel_law(model, links[memory.route[0]], memory.route[1]))
-    no_neutral_modes = np.zeros((sum(len(peer_class.z_names) for peer_class in modal_system.subsystems), 0))
+    no_neutral_modes = np.zeros((sum(len(peer_class.z_names) for peer_class in modal_system.peer_classes), 0))
     means = mean_loop(modal_system, reception.of(modal_system), memories, received_channels, no_neutral_modes)
     matrix, first = value_of(means.matrix), means.offsets[-1]
     noise = [index for channel in means.channels for index in channel.noise]
@@ -201,7 +201,7 @@ def substitution_frame(
     The frame map is the sum over all outcomes of the product of their indicators times their transition
     matrix: the part without ν is A, and the factor of ν_S is F_S.
     """
-    modal_system = dense_loop(reception.groups, reception.comm_graph)
+    modal_system = dense_loop(reception.peer_classes, reception.comm_graph)
     receivers, offsets, law = receivers_of(model, reception, modal_system, modal_system.coupling)
     senders_of_peers = [np.flatnonzero(receiver.received.any(axis=0)).tolist() for receiver in receivers]
     loss_channels = [(h, g, 0) for h, senders in enumerate(senders_of_peers) for g in senders]

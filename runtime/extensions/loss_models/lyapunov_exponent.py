@@ -53,7 +53,7 @@ def top_lyapunov_exponent(numeric: NumericModel, *, seed: int = 0) -> TopLyapuno
     reception = build_reception(numeric)
     refuse_unheld(model, reception)
     lossy = [link for link in model.links if link.channel]
-    states = sum(len(peer_class.z_names) * peer_class.count for peer_class in reception.groups)
+    states = sum(len(peer_class.z_names) * peer_class.count for peer_class in reception.peer_classes)
     states += sum(channels_of(link, model.peers) for link in lossy)
     if states > LYAPUNOV_STATES:
         message = f"{model.peers:,} peers and their channels have {states:,} states"

@@ -140,8 +140,8 @@ class Packets:
         self, modal_system: ModalSystem, numbers: Mapping[UncertainSample, int], depths: Mapping[str, int]
     ) -> ModalSystem:
         """Return a loop whose ticks receive the packets of the given numbers."""
-        subsystems = []
-        for peer_class, rows in zip(modal_system.subsystems, self.reception.of(modal_system), strict=True):
+        peer_classes = []
+        for peer_class, rows in zip(modal_system.peer_classes, self.reception.of(modal_system), strict=True):
             received = []
             for row in rows:
                 frames, slot = divmod(numbers[row], self.slots[row.coupling_term.link])
@@ -151,12 +151,12 @@ class Packets:
                     )
                 )
             stored = tuple(depths[sent.link] for sent in peer_class.schedule.sent)
-            subsystems.append(
+            peer_classes.append(
                 replace(
                     peer_class, schedule=replace(peer_class.schedule, received=tuple(received), depths=stored)
                 )
             )
-        return replace(modal_system, subsystems=tuple(subsystems))
+        return replace(modal_system, peer_classes=tuple(peer_classes))
 
 
 def trace_radius(numeric: NumericModel) -> TraceGrowth:
@@ -183,11 +183,11 @@ def trace_radius(numeric: NumericModel) -> TraceGrowth:
     received = {row: packets.received(row, trace=traces.get(row.coupling_term.link)) for row in packets.rows}
     depths = packets.depths((row, number) for row, numbers in received.items() for number in numbers)
     result = []
-    for modal_system in decompose(packets.reception.groups, packets.reception.comm_graph).loops:
+    for modal_system in decompose(packets.reception.peer_classes, packets.reception.comm_graph).loops:
         stored = sum(
-            depths[sent.link] for peer_class in modal_system.subsystems for sent in peer_class.schedule.sent
+            depths[sent.link] for peer_class in modal_system.peer_classes for sent in peer_class.schedule.sent
         )
-        if stored + sum(len(peer_class.z_names) for peer_class in modal_system.subsystems) > MATRIX_STATES:
+        if stored + sum(len(peer_class.z_names) for peer_class in modal_system.peer_classes) > MATRIX_STATES:
             raise NotSupportedError("the recorded delays exceed the supported length")
         result.append(_period_growth(modal_system, packets, received, depths, frames))
     low, high, radius, uncertainty = np.array(result).max(axis=0).tolist()
@@ -229,7 +229,7 @@ def _period_growth(
         if numbers not in frame_maps:
             frame_loop = packets.loop(modal_system, dict(zip(rows, numbers, strict=True)), depths)
             layout = lay_out_loop(frame_loop)
-            maps = [peer_class.lifted for peer_class in frame_loop.subsystems]
+            maps = [peer_class.lifted for peer_class in frame_loop.peer_classes]
             matrix = interconnect(
                 maps, feedback_of(frame_loop, layout), layout, numbers=MIDPOINT_RADIUS
             ).matrix

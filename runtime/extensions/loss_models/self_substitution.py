@@ -174,8 +174,8 @@ def receivers_of(
     (memory,) = stored
     link = next(link for link in model.links if link.name == memory.route[0])
     law = channel_law(model, link, memory.route[1])
-    counts = [peer_class.count for peer_class in common.subsystems]
-    subsystems = [with_memory(peer_class, stored) for peer_class in common.subsystems]
+    counts = [peer_class.count for peer_class in common.peer_classes]
+    subsystems = [with_memory(peer_class, stored) for peer_class in common.peer_classes]
     received_now = sorted(set(memory.memory.received.values()))
     values = []
     for subsystem in subsystems:
@@ -291,7 +291,7 @@ def _mean_matrix(
     spans, matrix = list(map(slice, starts, starts[1:])), np.zeros((2, starts[-1], starts[-1]))
     for index, g in enumerate(peer_versus_rest.class_of):
         for sender, (h, peer_class) in enumerate(
-            zip(peer_versus_rest.class_of, peer_versus_rest.modal_system.subsystems, strict=True)
+            zip(peer_versus_rest.class_of, peer_versus_rest.modal_system.peer_classes, strict=True)
         ):
             block = entrywise(
                 receivers[g].shares[h], rounded_number(float(peer_class.count - (sender == index)))
@@ -333,7 +333,7 @@ def _deviations(
         sum(
             peer_class.count
             for peer_class, g in zip(
-                peer_versus_rest.modal_system.subsystems, peer_versus_rest.class_of, strict=True
+                peer_versus_rest.modal_system.peer_classes, peer_versus_rest.class_of, strict=True
             )
             if g == first_class
         )

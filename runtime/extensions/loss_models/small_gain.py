@@ -115,14 +115,14 @@ def change_of_sent(
 
     def size(subsystem: int, link: str) -> float:
         """Return the norm of equal unit motions of a subsystem's n peers: √n, or weighted by scaling."""
-        return math.sqrt(modal_system.subsystems[subsystem].count) * sizes.get(
-            (link, modal_system.subsystems[subsystem].name), 1.0
+        return math.sqrt(modal_system.peer_classes[subsystem].count) * sizes.get(
+            (link, modal_system.peer_classes[subsystem].name), 1.0
         )
 
     channels = set()
     entering = []
     for g, lines, times in error_bound:
-        received = modal_system.subsystems[g].schedule.received[next(iter(lines))]
+        received = modal_system.peer_classes[g].schedule.received[next(iter(lines))]
         channels.add((received.sent.link, received.sent.channel))
         # If several values are received as one combination, the first with a nonzero weight is the reference.
         if ratios.get((received.sent.link, received.sent.channel), 1) == 1:
@@ -140,14 +140,14 @@ def change_of_sent(
                 before[:, packet_row, at] = share, 8 * UNIT_ROUNDOFF * share
         feedback.append(InterconnectionMatrices(receives.direct, before))
     closed = interconnect(
-        [peer_class.lifted for peer_class in modal_system.subsystems],
+        [peer_class.lifted for peer_class in modal_system.peer_classes],
         feedback,
         layout,
         numbers=MIDPOINT_RADIUS,
     )
     senders = [
         (h, row, sent)
-        for h, peer_class in enumerate(modal_system.subsystems)
+        for h, peer_class in enumerate(modal_system.peer_classes)
         for row, sent in enumerate(peer_class.schedule.sent)
     ]
     indices = {(packet.subsystem, packet.row, packet.lag): index for packet, index in layout.indices.items()}
@@ -179,7 +179,7 @@ def change_of_sent(
     )
 
 
-def ratios_of(subsystems: Sequence[PeerClass], lossy: frozenset[str]) -> Ratios:
+def ratios_of(peer_classes: Sequence[PeerClass], lossy: frozenset[str]) -> Ratios:
     """Return the ratios of channels that every tick of every subsystem combines into the same number.
 
     The channels of other links stay separate. The first channel with nonzero weight has the ratio 1.
@@ -187,7 +187,7 @@ def ratios_of(subsystems: Sequence[PeerClass], lossy: frozenset[str]) -> Ratios:
     result: dict[tuple[str, str], Fraction] = {}
     for link in sorted(lossy):
         columns: dict[str, dict[tuple[int, int, int, CouplingTerm], Fraction]] = {}
-        for g, peer_class in enumerate(subsystems):
+        for g, peer_class in enumerate(peer_classes):
             used_channels = {
                 (received.coupling_term, received.sent.channel) for _, received in used_rows(peer_class, link)
             }
@@ -236,11 +236,11 @@ def weight_of(loops: Sequence[ModalSystem], lossy: frozenset[str]) -> tuple[floa
         used_terms = {
             received.coupling_term
             for modal_system in loops
-            for peer_class in modal_system.subsystems
+            for peer_class in modal_system.peer_classes
             for _, received in used_rows(peer_class, link)
         }
-        for modal_system in loops if len(loops[0].subsystems) == 1 else loops[:1]:
-            count = np.array([peer_class.count for peer_class in modal_system.subsystems], np.float64)
+        for modal_system in loops if len(loops[0].peer_classes) == 1 else loops[:1]:
+            count = np.array([peer_class.count for peer_class in modal_system.peer_classes], np.float64)
             blocks = [
                 (np.abs(np.array(rows, np.float64)) + modal_system.weight_errors.get(coupling_term, 0.0))
                 * np.sqrt(count[:, None] / count)
@@ -252,7 +252,7 @@ def weight_of(loops: Sequence[ModalSystem], lossy: frozenset[str]) -> tuple[floa
             units = _units(np.sum(blocks, axis=0))
             sizes |= {
                 (link, peer_class.name): unit
-                for peer_class, unit in zip(modal_system.subsystems, units.tolist(), strict=True)
+                for peer_class, unit in zip(modal_system.peer_classes, units.tolist(), strict=True)
             }
             scaled = np.concatenate([units[:, None] * block / units for block in blocks])
             largest = max(largest, float(np.linalg.norm(scaled, 2)))

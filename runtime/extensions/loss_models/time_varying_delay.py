@@ -93,10 +93,10 @@ def _loop_gain(numeric: NumericModel, delay: ParameterRef, low: Fraction, high: 
     varying_system = replace(middle, links=links)
     reception = build_reception(numeric.at(varying_system))
     refuse_unheld(varying_system, reception)
-    loops = orthogonal_loops(reception.groups, reception.comm_graph, GAIN_BOUND_STATES)
+    loops = orthogonal_loops(reception.peer_classes, reception.comm_graph, GAIN_BOUND_STATES)
     packets = Packets(varying_system, reception)
     lossy = frozenset(link.name for link in links if link.channel is not None)
-    ratios, (weight, sizes) = ratios_of(loops[0].subsystems, lossy), weight_of(loops, lossy)
+    ratios, (weight, sizes) = ratios_of(loops[0].peer_classes, lossy), weight_of(loops, lossy)
     received = {row: packets.received(row)[0] for row in packets.rows}
     spread = {
         row: math.hypot(packets.received(row, low)[0] - number, number - packets.received(row, high)[0])
@@ -109,7 +109,7 @@ def _loop_gain(numeric: NumericModel, delay: ParameterRef, low: Fraction, high: 
         rows = reception.of(modal_system)
         error_bound = [
             (g, {line: 0}, spread[rows[g][line]])
-            for g, peer_class in enumerate(nominal_loop.subsystems)
+            for g, peer_class in enumerate(nominal_loop.peer_classes)
             for line, _ in used_rows(peer_class, link.name)
             if spread.get(rows[g][line])
         ]

@@ -257,19 +257,19 @@ def _floats(signals: Sequence[_Signal], width: int) -> Floats:
 
 def _open_loop(model: Model, closed_loop: ClosedLoop) -> _OpenLoopMatrices:
     """Return the matrices of the model of all peers, cut open at every force."""
-    subsystems = closed_loop.subsystems
-    period, frame = _periods(model, subsystems)
+    peer_classes = closed_loop.peer_classes
+    period, frame = _periods(model, peer_classes)
     ratio = int(frame / period)
     timings = {timing.name: timing.value for timing in model.timings}
     starts = [
         0,
-        *itertools.accumulate(len(peer_class.jacobians.peer_type.states) for peer_class in subsystems),
+        *itertools.accumulate(len(peer_class.jacobians.peer_type.states) for peer_class in peer_classes),
     ]
     n = starts[-1]
-    if (n + 2 * len(subsystems)) * ratio > MOST_ROWS:
+    if (n + 2 * len(peer_classes)) * ratio > MOST_ROWS:
         message = (
-            f"the paper's matrices for {len(subsystems)} peers at {ratio} force ticks a frame have more than "
-            f"{MOST_ROWS:,} rows"
+            f"the paper's matrices for {len(peer_classes)} peers at {ratio} force ticks a frame have more "
+            f"than {MOST_ROWS:,} rows"
         )
         raise ApcError(Diagnostic("E862", SourceLocation(model.origin.topology), message, fix=_INSTEAD))
     sent = [
@@ -280,10 +280,10 @@ def _open_loop(model: Model, closed_loop: ClosedLoop) -> _OpenLoopMatrices:
             )
             for channel, row in zip(sending.channels, send.x, strict=True)
         }
-        for peer_class in subsystems
+        for peer_class in peer_classes
     ]
     received: dict[tuple[int, CouplingTerm, str], _Signal] = {}
-    for i, peer_class in enumerate(subsystems):
+    for i, peer_class in enumerate(peer_classes):
         several_delays = len({received.coupling_term.delay for received in peer_class.schedule.received}) > 1
         indices = (
             (p, k)
@@ -305,7 +305,7 @@ def _open_loop(model: Model, closed_loop: ClosedLoop) -> _OpenLoopMatrices:
     slow: list[_Signal] = []
     columns: tuple[list[int], list[int]] = [], []  # indices of holds, over all subsystems
     first = 0
-    for i, peer_class in enumerate(subsystems):
+    for i, peer_class in enumerate(peer_classes):
         peer_type, own_states = peer_class.jacobians.peer_type, slice(starts[i], starts[i + 1])
         clocks = [partition.clock for partition in peer_type.clocks]
         for column, hold in enumerate(peer_type.holds, first):
@@ -339,22 +339,22 @@ def _open_loop(model: Model, closed_loop: ClosedLoop) -> _OpenLoopMatrices:
 
     steps_of_class = {
         peer_class.index: discretize(peer_class.exact.a, peer_class.exact.b, [period])[0]
-        for peer_class in subsystems
+        for peer_class in peer_classes
     }
-    steps = [steps_of_class[peer_class.index] for peer_class in subsystems]
+    steps = [steps_of_class[peer_class.index] for peer_class in peer_classes]
     return _OpenLoopMatrices(
         ratio=ratio,
         period=period,
         states=tuple(
             f"{peer_class.name}.{state.name}"
-            for peer_class in subsystems
+            for peer_class in peer_classes
             for state in peer_class.jacobians.peer_type.states
         ),
         fast=tuple(fast),
         slow=tuple(slow),
         received=tuple(received.values()),
         ab=side_by_side(
-            np.hstack([peer_class.subsystem.a, peer_class.subsystem.b]) for peer_class in subsystems
+            np.hstack([peer_class.subsystem.a, peer_class.subsystem.b]) for peer_class in peer_classes
         ),
         step=with_error_radius(
             side_by_side(value_of(step) for step in steps),
@@ -527,7 +527,7 @@ def _without_rigid(loop: _OpenLoopMatrices, closed_loop: ClosedLoop, rigid: Rigi
     return ClosedLoop(
         name=PAPER,
         multiplicity=1,
-        subsystems=(),  # a separate matrix, its rigid modes already removed
+        peer_classes=(),  # a separate matrix, its rigid modes already removed
         coupling={},
         frame_s=loop.frame_s,
         layout=StateLayout((0,), tuple(names[index] for index in remaining), {}),
@@ -559,7 +559,7 @@ def _with_phase_advance(spectrum: Spectrum, direct: Spectrum) -> Spectrum:
 # ---- the paper's form ----
 
 
-def _periods(model: Model, subsystems: Sequence[PeerClass]) -> tuple[Fraction, Fraction]:
+def _periods(model: Model, peer_classes: Sequence[PeerClass]) -> tuple[Fraction, Fraction]:
     """Return the periods T_c and T_n in seconds.
 
     An error with all differences if the form is not the paper's.
@@ -568,20 +568,20 @@ def _periods(model: Model, subsystems: Sequence[PeerClass]) -> tuple[Fraction, F
     link_clock = {link.name: link.clock for link in model.links}
     holds = [
         hold
-        for peer_class in subsystems
+        for peer_class in peer_classes
         for hold, active_at_start in zip(
             peer_class.jacobians.peer_type.holds, peer_class.schedule.active_at_start, strict=True
         )
         if active_at_start is not None
     ]
     coupling_terms = [
-        received.coupling_term for peer_class in subsystems for received in peer_class.schedule.received
+        received.coupling_term for peer_class in peer_classes for received in peer_class.schedule.received
     ]
     forces = dict.fromkeys(hold.clock for hold in holds)
     networks = dict.fromkeys(term.clock or link_clock[term.link] for term in coupling_terms)
     missing = [
         text
-        for peer_class in {peer_class.index: peer_class for peer_class in subsystems}.values()
+        for peer_class in {peer_class.index: peer_class for peer_class in peer_classes}.values()
         for text in _form_differences(peer_class)
     ]
     if any(link.after for link in model.links):

@@ -126,7 +126,7 @@ def parametric_closed_loop(
     """
     return ParametricClosedLoop(
         closed_loop,
-        parametric_frames(tuple(subsystems), closed_loop.subsystems),
+        parametric_frames(tuple(subsystems), closed_loop.peer_classes),
         tuple(feedback_of(closed_loop, closed_loop.layout)),
         with_uncertainty(relative_coordinates(rigid.basis)),
         radius,

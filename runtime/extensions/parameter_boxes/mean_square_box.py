@@ -111,7 +111,7 @@ def prove_mean_square(model: Model, ranges: Sequence[Range], *, cells: int | Non
                 loop_without_packets,
                 [
                     problem.subsystems[problem.indices[peer_class.name]]
-                    for peer_class in loop_without_packets.subsystems
+                    for peer_class in loop_without_packets.peer_classes
                 ],
             ):
                 note = (
@@ -140,7 +140,7 @@ def _box_problem(model: Model, ranges: Sequence[Range]) -> _BoxProblem:
     def lifted(changed: Model) -> Any:
         """Return the groups and links of a model with a row of r for each tick."""
         result = build_reception(numeric.at(changed))
-        return result.groups, result.comm_graph
+        return result.peer_classes, result.comm_graph
 
     # The reference point is inside the box, as a link may have loss probability 0 at an end. It is shifted in
     # each range, because probabilities that add up to exactly 1 are those of bursts.
@@ -155,23 +155,23 @@ def _box_problem(model: Model, ranges: Sequence[Range]) -> _BoxProblem:
         _refuse_range(numeric.at(_model_at_point(model, ranges, point)), interval)
     parametric = parametric_subsystems(numeric, [ranges[index] for index in peer_ranges], lifted)
     reception = build_reception(numeric.at(parametric.at))
-    subsystems = tuple(parametric.subsystems[peer_class.name] for peer_class in reception.groups)
-    frames = parametric_frames(subsystems, reception.groups)
+    subsystems = tuple(parametric.subsystems[peer_class.name] for peer_class in reception.peer_classes)
+    frames = parametric_frames(subsystems, reception.peer_classes)
     box = tuple((ranges[index].low, ranges[index].high) for index in peer_ranges)
     maps = [frame_map.mapped(lambda block: hull(block)[0]) for frame_map in frames_over(frames, (box,))]
     lifted_wide = [
-        peer_class.with_lifted(frame) for peer_class, frame in zip(reception.groups, maps, strict=True)
+        peer_class.with_lifted(frame) for peer_class, frame in zip(reception.peer_classes, maps, strict=True)
     ]
-    loop_over_box = common_modal_system(replace(reception, groups=tuple(lifted_wide)))[0]
+    loop_over_box = common_modal_system(replace(reception, peer_classes=tuple(lifted_wide)))[0]
     memories = stored_of(parametric.at, reception, loop_over_box)
     classes = classes_of(reception)
     indices = {
         peer_class.name: next(
             index
-            for index, candidate in enumerate(reception.groups)
+            for index, candidate in enumerate(reception.peer_classes)
             if peer_class.peers.first in candidate.peers
         )
-        for peer_class in classes.common.subsystems
+        for peer_class in classes.common.peer_classes
     }
     return _BoxProblem(
         numeric, tuple(ranges), peer_ranges, classes, subsystems, frames, indices, loop_over_box, memories

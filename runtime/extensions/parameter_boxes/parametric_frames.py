@@ -63,14 +63,14 @@ def parametric_models(
         refuse_channel_number(numeric.model, interval.free, LOCATION)
     subsystems = parametric_subsystems(numeric, ranges, lambda changed: lifted_classes(numeric.at(changed)))
     subsystem_of_class = {
-        peer_class.index: subsystems.subsystems[peer_class.name] for peer_class in subsystems.groups
+        peer_class.index: subsystems.subsystems[peer_class.name] for peer_class in subsystems.peer_classes
     }
     return [
         (
             closed_system,
-            tuple(subsystem_of_class[peer_class.index] for peer_class in closed_system.subsystems),
+            tuple(subsystem_of_class[peer_class.index] for peer_class in closed_system.peer_classes),
         )
-        for closed_system in split(subsystems.groups, subsystems.comm_graph)
+        for closed_system in split(subsystems.peer_classes, subsystems.comm_graph)
     ]
 
 
@@ -83,7 +83,7 @@ class ParametricSubsystems:
     """
 
     at: Model
-    groups: tuple[PeerClass, ...]
+    peer_classes: tuple[PeerClass, ...]
     comm_graph: CommunicationGraph
     subsystems: Mapping[str, LinearSubsystem]
 
@@ -121,14 +121,14 @@ def parametric_subsystems(
         for index, interval in enumerate(ranges, 1)
     ]
     at = apply(model, point)
-    groups, comm_graph = lifted(at)
+    peer_classes, comm_graph = lifted(at)
     subsystems = {
         peer_class.name: _parametric_subsystem(
             peer_class, symbolic_parameters[comm_graph.group_of(peer_class.peers.first)], model
         )
-        for peer_class in groups
+        for peer_class in peer_classes
     }
-    return ParametricSubsystems(at, groups, comm_graph, subsystems)
+    return ParametricSubsystems(at, peer_classes, comm_graph, subsystems)
 
 
 def _dependent_parameters(

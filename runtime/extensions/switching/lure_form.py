@@ -197,7 +197,7 @@ def lure_plants(numeric: NumericModel) -> list[LurePlant]:
     loops = orthogonal_loops([item.peer_class for item in cut_classes], numeric.comm_graph, LURE_STATES)
     result = []
     for modal_system in loops:
-        cut_groups = [cut_of_class[peer_class.index] for peer_class in modal_system.subsystems]
+        cut_groups = [cut_of_class[peer_class.index] for peer_class in modal_system.peer_classes]
         size = modal_system.states + sum(len(cut_classes.ticks) for cut_classes in cut_groups)
         if size > LURE_STATES:
             raise NotSupportedError(f"{size:,} coupled states and contact ticks; the limit is {LURE_STATES}")
@@ -247,7 +247,7 @@ def _lure_plant(modal_system: ModalSystem, cut_classes: Sequence[CutPeers]) -> L
         (*cut_peers.peer_class.z_names, *(f"{part}[{tick}]" for part, tick in cut_peers.ticks))
         for cut_peers in cut_classes
     ]
-    layout = lay_out(names, [peer_class.schedule for peer_class in modal_system.subsystems])
+    layout = lay_out(names, [peer_class.schedule for peer_class in modal_system.peer_classes])
     closed = interconnect_with_inputs(
         modal_system,
         [cut_peers.map for cut_peers in cut_classes],
@@ -257,7 +257,7 @@ def _lure_plant(modal_system: ModalSystem, cut_classes: Sequence[CutPeers]) -> L
     ).matrix
     n, placed = (
         len(layout.names),
-        list(zip(modal_system.subsystems, cut_classes, layout.offsets, strict=True)),
+        list(zip(modal_system.peer_classes, cut_classes, layout.offsets, strict=True)),
     )
     port_rows = np.concatenate(
         [offset + cut_peers.states + np.arange(len(cut_peers.ticks)) for _, cut_peers, offset in placed]
