@@ -68,7 +68,7 @@ INWARDS = 1e-9
 
 # The logarithm of a spectral radius that is clearly off the circle: an analysis decides it without matrices.
 # The multiple of its error from the crossing at which verdicts are decided.
-AWAY, CLEARLY = 1e-9, 1.03
+AWAY, CLEARLY = 1e-9, 1.1
 
 # The radius is discontinuous in a bracket narrower than this, relative to the value, if it changes by more
 # than this, beyond its errors.
@@ -721,7 +721,8 @@ def _crossing_in_floats(
     """Return the value between two ends at which the spectral radius in floats crosses 1, and how far it may
     be off because verdicts near it are undecided.
 
-    By Newton's method, or by Brent's method if Newton's leaves the ends or slopes are missing.
+    By Newton's method, with the slope of a secant where there is none, or by Brent's method if it leaves the
+    ends.
 
     Parameters
     ----------
@@ -750,40 +751,65 @@ def _crossing_in_floats(
                 cached[value] = 0.0, math.nan
         return cached[value]
 
-    (low, high), (at_low, at_high) = ends, log_radii
-    value = low + (high - low) * at_low / (at_low - at_high)
-    for _ in range(NEWTON):
-        log_radius, slope = log_radius_at(value)
-        next_value = value - log_radius / slope if slope else math.nan
-        if not low <= next_value <= high:
-            break
-        if abs(next_value - value) <= tolerance * abs(next_value):
-            return next_value, 0.0
-        value = next_value
-    # Imported where Newton's method fails: the import takes as long as an analysis.
-    brentq = load_pool("scipy.optimize").brentq
-    root_tolerance = tolerance / 100
-    # If the method ends early, for example between adjacent floats, verdicts use the last bracket.
-    root = float(
-        brentq(
-            lambda value: log_radius_at(value)[0],
-            low,
-            high,
-            xtol=root_tolerance * segment.least or math.ulp(0.0),
-            rtol=max(root_tolerance, 4 * np.finfo(float).eps),
-            maxiter=BRENT,
-            disp=False,
+    root = _newton_root(log_radius_at, ends, log_radii, tolerance)
+    if root is None:
+        # Imported where Newton's method fails: the import takes as long as an analysis.
+        brentq = load_pool("scipy.optimize").brentq
+        root_tolerance = tolerance / 100
+        # If the method ends early, for example between adjacent floats, verdicts use the last bracket.
+        root = float(
+            brentq(
+                lambda value: log_radius_at(value)[0],
+                *ends,
+                xtol=root_tolerance * segment.least or math.ulp(0.0),
+                rtol=max(root_tolerance, 4 * np.finfo(float).eps),
+                maxiter=BRENT,
+                disp=False,
+            )
         )
-    )
     if segment.quick_at is None:
         return root, 0.0
     at_root, error = log_radius_at(root)[0], segment.quick_at(Fraction(root)).error
     if at_root and not math.isnan(error):
         return root, 0.0
-    # By the slope to the nearest decided value.
+    # By the slope to the nearest decided value, a stable one if there is one: a verdict of instability may
+    # have only a wide bound.
     away = AWAY if math.isnan(error) else 0.0
     decided = [point for point, (log_radius, _) in cached.items() if abs(log_radius) > away]
-    nearest = min(decided, key=lambda point: abs(point - root))
+    nearest = min(decided, key=lambda point: (cached[point][0] > 0, abs(point - root)))
     if math.isnan(error):  # a radius without a bound: that of the analysis there
         error = CLEARLY * segment.verdict_at(Fraction(nearest)).error
     return root, error * abs((nearest - root) / (cached[nearest][0] - at_root))
+
+
+def _newton_root(
+    function: Callable[[float], tuple[float, float]],
+    ends: Sequence[float],
+    values_at_ends: Sequence[float],
+    tolerance: float,
+) -> float | None:
+    """Return the root of a function between two ends by Newton's method; None if it leaves the ends.
+
+    Parameters
+    ----------
+    function
+        The function, with its slope; NaN where there is none, and that of the last secant is used.
+    ends, values_at_ends
+        Two values with function values of different signs.
+    tolerance
+        The largest relative change of the value at which the method ends.
+    """
+    (low, high), (at_low, at_high) = ends, values_at_ends
+    last, at_last = (low, at_low) if abs(at_low) < abs(at_high) else (high, at_high)
+    value = low + (high - low) * at_low / (at_low - at_high)
+    for _ in range(NEWTON):
+        at_value, slope = function(value)
+        if math.isnan(slope):
+            slope = (at_value - at_last) / (value - last) if value != last else 0.0
+        last, at_last = value, at_value
+        value = value - at_value / slope if slope else math.nan
+        if not low <= value <= high:
+            return None
+        if abs(value - last) <= tolerance * abs(value):
+            return value
+    return None
