@@ -44,6 +44,9 @@ WIDEST = 1e-3
 # zero interferes, wider circles are tried, up to this number.
 OUTSIDE, TRIES = 8.0, 10
 
+# A circle between the largest zero and the next is counted if their distance is this multiple of the error.
+APART = 100.0
+
 # The ratio of the radius of a circle about a zero to the zero's error: then few arcs suffice.
 CLEAR = 6.0
 
@@ -278,9 +281,17 @@ def find_zeros(
     wider = sorted((2 * np.abs(zeros - 1)[np.abs(zeros - 1) < WIDEST]).tolist(), reverse=True)
     rigid_radius = _rigid_radius(function, rigid, wider, rigid_radius)
     zeros = _distinct(zeros, rigid_radius)
-    error_of = cache(lambda zero: enclosing_radius(function, zero)[0])
+    disc_of = cache(partial(enclosing_radius, function))
+
+    def error_of(zero: complex) -> float:
+        """Return the radius of a circle about a zero with eigenvalues in it, or inf."""
+        return disc_of(zero)[0]
+
     low, high, outside_count = 0.0, 0.0, -1
     for attempt in range(SEARCHES):
+        if single := _bound_of_single_zero(function, zeros, exact, disc_of, rigid, rigid_radius):
+            high, outside_count = single, 0
+            break
         largest, error = _largest(zeros, exact, error_of)
         width = max(OUTSIDE * error, 4 * FIRST_RADIUS) if np.isfinite(error) else WIDEST
         high, outside_count = first_counted_circle(function, largest, width, rigid, rigid_radius)
@@ -361,6 +372,44 @@ def _largest(
     if len(zeros) and (largest is None or abs(zeros[0]) >= abs(largest.value)):
         return float(abs(zeros[0])), error_of(complex(zeros[0]))
     return (abs(largest.value), largest.error) if largest else (0.0, 0.0)
+
+
+def _bound_of_single_zero(
+    function: Characteristic,
+    zeros: Complexes,
+    exact: Sequence[Zero],
+    disc_of: Callable[[complex], tuple[float, int]],
+    rigid: int,
+    rigid_radius: float,
+) -> float:
+    """Return a bound on the spectral radius if one zero, or one pair, is larger than the others; else 0.
+
+    A circle between it and the next known zero is far from both, and the eigenvalues outside are those of the
+    zero's own circle.
+
+    Parameters
+    ----------
+    function, zeros, exact
+        f, its zeros, the largest first, and the eigenvalues of single subsystems.
+    disc_of
+        The radius of a circle about a zero, and the number of eigenvalues in it.
+    rigid, rigid_radius
+        As for `first_counted_circle`.
+    """
+    if len(zeros) < 2:
+        return 0.0
+    largest, following = complex(zeros[0]), max([abs(zeros[1]), *(abs(zero.value) for zero in exact)])
+    middle, (error, inside) = (abs(largest) + following) / 2, disc_of(largest)
+    is_real = not largest.imag
+    if (
+        not abs(largest) - following > APART * error
+        or not (is_real or abs(largest.imag) > error)
+        or middle <= function.innermost * INMOST
+        or (rigid and (abs(middle - 1) <= rigid_radius or abs(largest - 1) <= rigid_radius + error))
+        or count_outside(function, middle, rigid) != inside * (1 if is_real else 2)
+    ):
+        return 0.0
+    return (abs(largest) + error) * (1 + 4 * float(np.finfo(float).eps))
 
 
 def _rigid_radius(function: Characteristic, rigid: int, radii: Sequence[float], value: float) -> float:

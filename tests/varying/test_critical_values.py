@@ -652,3 +652,17 @@ def test_a_search_over_many_packets_evaluates_the_side_of_one_by_a_count() -> No
         assert (quick < 1) is analysis.stable is (value < found.value)
         if abs(analysis.spectral_radius - 1) < 0.01:
             assert quick == pytest.approx(analysis.spectral_radius, abs=analysis.spectral_radius_error)
+
+
+def test_the_bound_of_a_single_largest_eigenvalue_holds_and_is_narrow() -> None:
+    """One pair is larger than the others, of 300 frames of delay; the matrix of all states agrees."""
+    model = apc.set_parameters(compiled(AVERAGE), {"lan.delay": "2.4 s", "contact.stiffness": "0 N/m"})
+    found = apc.critical(model, "coordination.stiffness", lower=1.0, upper=20_000.0)
+    assert found.value is not None and found.error is not None and found.error < 1e-9 * found.value
+    for side in (-1, 1):
+        value = found.value + side * 2 * found.error
+        numeric = numeric_model(apc.set_parameters(model, {"coordination.stiffness": value}))
+        analysis, matrix = analyze(numeric), analyze(numeric, method="modes")
+        assert analysis.method == "determinant" and analysis.stable is (side < 0)
+        apart = abs(matrix.spectral_radius - analysis.spectral_radius)
+        assert apart <= matrix.spectral_radius_error + analysis.spectral_radius_error < 1e-11
