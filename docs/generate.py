@@ -8,6 +8,7 @@ Does not: execute notebooks; their outputs are stored with them.
 from __future__ import annotations
 
 import ast
+import json
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -29,6 +30,7 @@ ROOT = Path(__file__).parent.parent
 TUTORIALS = ROOT / "models" / "notebooks"
 PUBLISHED = ROOT / "models" / "published" / "results.yaml"
 MESSAGES = ROOT / "tests" / "language" / "messages.txt"
+TESTS_OF_THRESHOLDS = ROOT / "tests" / "mutants" / "thresholds.json"
 # The subpackages whose constants can decide an answer: core and studies, in the order of the layers.
 DECIDING = (
     *("parameter_values", "linearization", "timing", "lifting", "network", "spectrum", "analysis"),
@@ -247,13 +249,30 @@ def _thresholds() -> Iterator[str]:
     yield from ("# Thresholds", "")
     yield "The numeric constants of core, studies and extensions, each with its reason, from the sources."
     yield "The largest numbers of states are those of `support.state_limits`."
+    yield "The test is one that fails where the value is ten times larger or smaller; limits of work,"
+    yield "sizes, caches, and bounds that any smaller number would serve have none"
+    yield "(`python -m tests.mutants.thresholds`)."
+    tests = json.loads(TESTS_OF_THRESHOLDS.read_text(encoding="utf-8"))
     for package in DECIDING:
-        rows = [
-            f"| `{names}` | {value} | `{path.stem}` | {reason} |"
-            for path in sorted((ROOT / "runtime" / package).rglob("*.py"))
-            for names, value, reason in constants(path)
-        ]
-        yield from ("", f"## {package}", "", "| name | value | module | reason |", "|---|---|---|---|", *rows)
+        rows = []
+        for path in sorted((ROOT / "runtime" / package).rglob("*.py")):
+            for names, value, reason in constants(path):
+                file, _, test = tests.get(threshold_key(path, names), "").rpartition("::")
+                shown = f"`{test}` in `{file.removeprefix('tests/')}`" if test else ""
+                rows.append(f"| `{names}` | {value} | `{path.stem}` | {reason} | {shown} |")
+        yield from (
+            "",
+            f"## {package}",
+            "",
+            "| name | value | module | reason | test |",
+            "|---|---|---|---|---|",
+        )
+        yield from rows
+
+
+def threshold_key(path: Path, names: str) -> str:
+    """Return the key of a constant in the table of tests: its module without `runtime`, and its names."""
+    return ".".join((*path.relative_to(ROOT / "runtime").with_suffix("").parts, names))
 
 
 def constants(path: Path) -> Iterator[tuple[str, str, str]]:

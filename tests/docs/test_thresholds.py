@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from importlib import import_module
 from pathlib import Path
@@ -24,6 +25,20 @@ def test_every_constant_has_a_reason(generate: object) -> None:
     found = [(path.name, *row) for path in files for row in generate.constants(path)]  # type: ignore[attr-defined]
     assert len(found) > 300
     assert not [row for row in found if not row[-1]]
+
+
+def test_the_named_tests_and_constants_exist(generate: object) -> None:
+    tests = json.loads(generate.TESTS_OF_THRESHOLDS.read_text(encoding="utf-8"))  # type: ignore[attr-defined]
+    keys = {
+        generate.threshold_key(path, names)  # type: ignore[attr-defined]
+        for package in generate.DECIDING  # type: ignore[attr-defined]
+        for path in (ROOT / "runtime" / package).rglob("*.py")
+        for names, *_ in generate.constants(path)  # type: ignore[attr-defined]
+    }
+    assert not set(tests) - keys, "constants that are gone"
+    for test in filter(None, tests.values()):
+        file, *_, function = test.split("::")
+        assert f"def {function}(" in (ROOT / file).read_text(encoding="utf-8"), test
 
 
 def test_the_reason_is_that_of_the_line_or_of_the_block(generate: object, tmp_path: Path) -> None:

@@ -14,16 +14,12 @@ import concurrent.futures
 import json
 import os
 import queue
-import shutil
-import subprocess
-import sys
 import tempfile
 from collections import Counter
 from pathlib import Path
 
+from tests.mutants.copies import ROOT, product_copy, run_tests
 from tests.mutants.sites import Mutant, draw
-
-ROOT = Path(__file__).resolve().parents[2]
 
 
 def main() -> None:
@@ -41,11 +37,11 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         copies: queue.Queue[Path] = queue.Queue()
         for place in range(requested.jobs):
-            copies.put(_copy(Path(folder) / str(place)))
+            copies.put(product_copy(Path(folder) / str(place)))
         reach = requested.reach or Path(folder) / "reach.json"
         if not reach.exists():
             copy = copies.get()
-            _run(copy, ["watched", str(copy), str(reach.resolve()), *words], limit=None)
+            run_tests(copy, ["watched", str(copy), str(reach.resolve()), *words], limit=None)
             copies.put(copy)
         known = json.loads(reach.read_text(encoding="utf-8"))
 
@@ -66,48 +62,6 @@ def main() -> None:
                 print(f"{fate:12s} {mutant.path}:{mutant.line} {mutant.kind}: {_line(mutant)}", flush=True)
     counted = Counter(fates)
     print(f"{len(drawn)} mutants: " + ", ".join(f"{count} {fate}" for fate, count in sorted(counted.items())))
-
-
-def _copy(folder: Path) -> Path:
-    """Copy the product and the tests, and lay `lib/apc` out as the package is installed."""
-    keep = shutil.ignore_patterns("__pycache__", "*.apc")
-    for name in ("compiler", "runtime", "models", "tests"):
-        shutil.copytree(ROOT / name, folder / name, ignore=keep)
-    for name in ("pyproject.toml", "setup.py", "README.md", "CHANGELOG.md", "LICENSE"):
-        shutil.copy(ROOT / name, folder / name)
-    package = folder / "lib" / "apc"
-    package.mkdir(parents=True)
-    for path in (folder / "runtime").iterdir():
-        (package / path.name).symlink_to(path)
-    for name in ("compiler", "models"):
-        (package / name).symlink_to(folder / name)
-    return folder
-
-
-def _run(copy: Path, words: list[str], limit: float | None) -> int | None:
-    """Return the exit code of a run of tests in a copy, or None if it was stopped at the limit (s)."""
-    environment = os.environ | {
-        "PYTHONPATH": str(copy / "lib"),
-        "PYTHONDONTWRITEBYTECODE": "1",
-        "OMP_NUM_THREADS": "1",
-        "OPENBLAS_NUM_THREADS": "1",
-        "TMPDIR": str(copy / "tmp"),
-    }
-    (copy / "tmp").mkdir(exist_ok=True)
-    command = [sys.executable, str(copy / "tests" / "mutants" / "reach.py"), *words]
-    with (copy / "log.txt").open("w") as log:
-        process = subprocess.Popen(
-            command, cwd=copy, env=environment, stdout=log, stderr=log, start_new_session=True
-        )
-        try:
-            return process.wait(limit)
-        except subprocess.TimeoutExpired:
-            return None
-        finally:
-            if process.poll() is None:
-                os.killpg(process.pid, 9)
-                process.wait()
-            shutil.rmtree(copy / "tmp", ignore_errors=True)
 
 
 def _concerned(mutant: Mutant, known: dict[str, object], seconds: float) -> tuple[list[str], float]:
@@ -135,7 +89,7 @@ def _fate(copy: Path, mutant: Mutant, names: list[str], cost: float, words: list
     (copy / "names.json").write_text(json.dumps(names), encoding="utf-8")
     path.write_text(mutant.applied(text), encoding="utf-8")
     try:
-        code = _run(copy, ["chosen", str(copy / "names.json"), *words], limit=60 + 10 * cost)
+        code = run_tests(copy, ["chosen", str(copy / "names.json"), *words], limit=60 + 10 * cost)
     finally:
         path.write_text(text, encoding="utf-8")
     return "survived" if code == 0 else "caught"
