@@ -721,8 +721,8 @@ def _crossing_in_floats(
     """Return the value between two ends at which the spectral radius in floats crosses 1, and how far it may
     be off because verdicts near it are undecided.
 
-    By Newton's method, with the slope of a secant where there is none, or by Brent's method if it leaves the
-    ends.
+    By Newton's method, with the slope of a secant where there is none, or by Brent's method if it does not
+    converge.
 
     Parameters
     ----------
@@ -788,7 +788,9 @@ def _newton_root(
     values_at_ends: Sequence[float],
     tolerance: float,
 ) -> float | None:
-    """Return the root of a function between two ends by Newton's method; None if it leaves the ends.
+    """Return the root of a function between two ends by Newton's method; None if it does not converge.
+
+    A step that leaves the ends is replaced by the middle.
 
     Parameters
     ----------
@@ -806,10 +808,11 @@ def _newton_root(
         at_value, slope = function(value)
         if math.isnan(slope):
             slope = (at_value - at_last) / (value - last) if value != last else 0.0
+        low, high = (value, high) if (at_value < 0) is (at_low < 0) else (low, value)
         last, at_last = value, at_value
         value = value - at_value / slope if slope else math.nan
         if not low <= value <= high:
-            return None
+            value = (low + high) / 2
         if abs(value - last) <= tolerance * abs(value):
             return value
     return None
