@@ -13,8 +13,8 @@ ROOT = Path(__file__).resolve().parents[2]
 
 def product_copy(folder: Path) -> Path:
     """Copy the product and the tests, and lay `lib/apc` out as the package is installed."""
-    keep = shutil.ignore_patterns("__pycache__", "*.apc")
-    for name in ("compiler", "runtime", "models", "tests"):
+    keep = shutil.ignore_patterns("__pycache__", "*.apc", "_build")
+    for name in ("compiler", "runtime", "models", "tests", "docs"):
         shutil.copytree(ROOT / name, folder / name, ignore=keep)
     for name in ("pyproject.toml", "setup.py", "README.md", "CHANGELOG.md", "LICENSE"):
         shutil.copy(ROOT / name, folder / name)
