@@ -184,11 +184,15 @@ def fit_motion(step: float, values: Floats, scale: Floats) -> Fit | None:
 def _sample_stride(window: Floats) -> int:
     """Return the number of rows per sample of the fit, such that the fastest visible motion is well
     sampled.
+
+    A ramp or a slow motion hides the reversals of a faster one in the steps, but not in their differences.
     """
-    steps = np.diff(window, axis=0)
-    visible = np.abs(steps) > AT_REST * np.ptp(window, axis=0)
-    signs = np.sign(steps) * visible
-    reversals = int((signs[1:] * signs[:-1] < 0).sum(axis=0).max(initial=0))
+    motion = _detrended(window)
+    reversals = 0
+    for order, least in ((1, AT_REST), (2, VISIBLE * LARGE)):
+        differences = np.diff(motion, order, axis=0)
+        signs = np.sign(differences) * (np.abs(differences) > least * np.ptp(motion, axis=0))
+        reversals = max(reversals, int((signs[1:] * signs[:-1] < 0).sum(axis=0).max(initial=0)))
     period = 2 * len(window) / reversals if reversals else math.inf
     return int(max(1, min(len(window) // (MOST // 2), period / A_PERIOD)))
 

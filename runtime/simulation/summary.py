@@ -287,10 +287,10 @@ class SummaryAccumulator:
             return (MotionVerdict.DECAYS, "") if settled else (MotionVerdict.NOT_DETERMINED, SHORT)
         if fit.grows and not fit.ended:
             return MotionVerdict.DIVERGES, ""
+        if fit.ramp and not fit.ended:  # larger than any oscillation about it
+            return MotionVerdict.DRIFTS, ""
         if fit.lasts and not fit.ended:
             return MotionVerdict.OSCILLATES, ""
-        if fit.ramp and not fit.ended:
-            return MotionVerdict.DRIFTS, ""
         if fit.decays or fit.ended or settled:
             return MotionVerdict.DECAYS, ""
         return MotionVerdict.NOT_DETERMINED, SHORT

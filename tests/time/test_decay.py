@@ -57,6 +57,25 @@ def test_what_moves_on_is_a_ramp_and_neither_decays_nor_oscillates(seconds: floa
     assert found.ramp and not found.decays and not found.grows and found.oscillation is None
 
 
+@pytest.mark.parametrize("seconds", [2.0, 3.0, 6.0, 20.0])
+@pytest.mark.parametrize("slow", ["ramp", "decay", "sway"])
+def test_a_fast_ripple_about_a_slow_motion_is_no_alias(slow: str, seconds: float) -> None:
+    t = instants(seconds)
+    about = {
+        "ramp": 0.2 * t,
+        "decay": np.exp(-8 * t / seconds),
+        "sway": 1e-4 * np.sin(2 * np.pi * t / seconds),
+    }
+    found = fitted(about[slow] + 1e-5 * np.sin(2 * np.pi * 125 * t + 0.3))
+    assert found.ramp is (slow == "ramp")
+    if slow == "ramp":
+        assert found.oscillation is not None
+        assert abs(found.oscillation.frequency - 125) <= max(found.oscillation.error, 1e-3)
+    elif found.oscillation is not None:
+        hertz = found.oscillation.frequency
+        assert min(abs(hertz - 125), abs(hertz - 1 / seconds)) <= max(found.oscillation.error, 0.1 / seconds)
+
+
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("rate", [-1.0, 0.0, 1.0])
 def test_the_error_holds_under_noise(rate: float, seed: int) -> None:
