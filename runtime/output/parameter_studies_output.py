@@ -151,11 +151,11 @@ def _sides(crossing: Crossing) -> str:
 
 
 def _on_stable_side(value: float, error: float, side: str) -> float:
-    """Return a crossing as far inside as its error, to no digit that the error hides."""
+    """Return a crossing as far inside as its error, to the digits that the error leaves and one more."""
     inward = -error if side == "below" else error
     if not math.isfinite(inward):
         return value
-    known = Decimal(value).adjusted() - Decimal(error).adjusted() if inward else SHOWN
+    known = Decimal(value).adjusted() - Decimal(error).adjusted() + 1 if inward else SHOWN
     context = Context(min(max(known, 1), SHOWN), ROUND_FLOOR if side == "below" else ROUND_CEILING)
     return float(context.create_decimal_from_float(value + inward))
 

@@ -10,7 +10,7 @@ Does not: prove that there are no further crossings, or separate two within one 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import Any, Unpack
@@ -79,7 +79,7 @@ from apc.studies.stability_criteria import (
     scale_of,
     verdict_with,
 )
-from apc.studies.timing_values import is_scaled, reaches_period, refuse_phase
+from apc.studies.timing_values import MOST_FRAME_TICKS, is_scaled, reaches_period, refuse_phase
 from apc.support.option_value import option_value
 from apc.support.state_limits import SEARCH_STATES
 from apc.support.threads import single_threaded
@@ -268,6 +268,7 @@ def critical(
         model=model,
         limitations=(
             *start_limitations,
+            *_ranges_of_long_frames(model, parameter_ref, limits, result.searched_to),
             *limitations(model, network=chosen_criterion != MEAN_SQUARE, varied=[parameter_ref]),
             *(replaced_hands(model) if chosen_criterion == PASSIVE else ()),
         ),
@@ -277,6 +278,23 @@ def critical(
         undecided=result.undecided,
         isolated=result.isolated,
     )
+
+
+def _ranges_of_long_frames(
+    model: Model,
+    parameter_ref: ParameterRef,
+    limits: Sequence[Fraction | None],
+    searched_to: tuple[float, float],
+) -> Iterator[str]:
+    """Yield the ends of a requested range of periods that were not searched, as no frame there is short."""
+    (low, high), (first, last) = limits, searched_to
+    if not reaches_period(model, parameter_ref) or is_scaled(model, parameter_ref):
+        return
+    unit = str(unit_of(model, parameter_ref.name))
+    for begin, end in ((low, first), (last, high)):
+        if begin is not None and end is not None and float(begin) < float(end):
+            span = " to ".join(with_unit(f"{float(value):g}", unit) for value in (begin, end))
+            yield f"{span} not searched: more than {MOST_FRAME_TICKS} ticks in a frame with the other clocks"
 
 
 def _search_by_criterion(

@@ -14,7 +14,7 @@ from apc.lifting.numeric_model import numeric_model
 from apc.parameter_values.overrides import apply, parse_override
 from apc.parameter_values.parameter_names import ParameterRef
 from apc.studies.timing_values import system_with_delay
-from tests.topologies import AVERAGE, compiled
+from tests.topologies import AVERAGE, compiled, replaced
 from tests.varying.closed_forms import built
 
 PULL = 97.3
@@ -168,3 +168,13 @@ def test_a_period_follows_a_rate_that_it_names() -> None:
     direct = apply(model, [parse_override(model, "haptic.period=2 ms")])
     radius = [analyze(numeric_model(compiled_model)).spectral_radius for compiled_model in (changed, direct)]
     assert radius[0] == radius[1]
+
+
+def test_a_range_of_periods_without_short_frames_is_said() -> None:
+    pairs = "lan: {clock: network, delay: 8 ms, pairs: {user: {user: {clock: slow}}}}"
+    changes = ("network: 8 ms", "network: 8 ms\n  slow: 60 Hz"), ("lan: {clock: network, delay: 8 ms}", pairs)
+    model = compiled(replaced(AVERAGE, *changes))
+    whole = apc.critical(model, "slow.period", lower="10 ms", upper="100 ms")
+    assert not any("not searched" in text for text in whole.limitations)
+    cut = apc.critical(model, "slow.period", lower="10 ms", upper="500 ms")
+    assert cut.searched_to[1] < 0.5 and any("0.5 s not searched" in text for text in cut.limitations)
