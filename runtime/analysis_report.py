@@ -91,7 +91,7 @@ class AnalysisReport(Result):
 
 
 def analysis_report(numeric: NumericModel, *, method: str = "auto", certify: bool = False) -> Analysis:
-    """Return the analysis of a system by a method of `analysis.analyze`, or by "paper" (see `paper_method`).
+    """Return the analysis of a model by a method of `analysis.analyze`, or by "paper" (see `paper_method`).
 
     Parameters
     ----------
@@ -137,7 +137,7 @@ def answer(
     margins: bool | None = None,
     with_limit_cycle: bool = False,
 ) -> AnalysisReport:
-    """Return the analysis of a system, with the additional results of `apc analyze`.
+    """Return the analysis of a model, with the additional results of `apc analyze`.
 
     Parameters
     ----------

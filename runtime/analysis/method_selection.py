@@ -18,7 +18,7 @@ from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.lifting.numeric_model import NumericModel
 from apc.linearization.jacobians import SubsystemJacobians
-from apc.spectrum.graph_loops import common_graph
+from apc.spectrum.graph_loops import reason_without_common_graph
 from apc.spectrum.interconnection import ModalSystem
 from apc.spectrum.modes import decompose, dense_loop, refuse_dense
 from apc.spectrum.peer_classes import (
@@ -206,7 +206,7 @@ def is_large_ring(peer_classes: Sequence[PeerClass], comm_graph: CommunicationGr
     shapes = {comm_graph.links[coupling_term.link].graph.shape for coupling_term in coupling_terms}
     if len(peer_classes) > 1 or shapes != {"ring"} or comm_graph.peers <= LARGEST_RING:
         return False
-    return not common_graph(coupling_terms, comm_graph)
+    return not reason_without_common_graph(coupling_terms, comm_graph)
 
 
 def cannot_serve(model: Model, method: str, reason: str) -> ApcError:

@@ -83,7 +83,7 @@ def critical_command(
     if over:
         if plot is not None:
             raise click.UsageError("--plot can't be combined with --over")
-        print_result(_over(model, path, (lower, upper), over, requested), as_json=as_json)
+        print_result(_largest_value_over(model, path, (lower, upper), over, requested), as_json=as_json)
         return
     with status_line() as progress:
         result = critical(model, path, lower=lower, upper=upper, criterion=requested, progress=progress)
@@ -94,7 +94,7 @@ def critical_command(
     print_result(result, as_json=as_json, written=[plot])
 
 
-def _over(
+def _largest_value_over(
     model: Model,
     path: str,
     ends: tuple[str | None, str | None],

@@ -190,7 +190,7 @@ def state_space(model: Model, *, open_at: str = "") -> StateSpace:
 
 
 def peers_of(numeric: NumericModel) -> tuple[tuple[PeerClass, ...], CommunicationGraph]:
-    """Return the peers of a system as `analysis.lifted_classes`; too large a system raises ApcError E951."""
+    """Return the lifted peer classes of a model; ApcError E951 if one is too large."""
     try:
         return lifted_classes(numeric)
     except ApcError as error:

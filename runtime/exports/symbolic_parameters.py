@@ -83,7 +83,7 @@ def state_space_of(model: Model, *, open_at: str = "", symbolic: Sequence[str] =
     values = dict(zip(parameter_refs, symbols, strict=True))
 
     def vector(peer_class: PeerClass) -> Any:
-        """Return the parameters of a group's first peer as CasADi expressions."""
+        """Return the parameters of a class's first peer as CasADi expressions."""
         index = comm_graph.group_of(peer_class.peers.first)
         peer = peer_class.peers.first - int(comm_graph.starts[index])
         entries = free_values(model, model.groups[index], peer, values, symbolic_function)
@@ -127,10 +127,10 @@ def _split_by_groups(peer_class: PeerClass, comm_graph: CommunicationGraph) -> l
 
 
 def _numbers(vector: Callable[[PeerClass], Any]) -> FrameNumbers:
-    """Return the numerical parts of a frame, as CasADi expressions of each group's parameters (n_p,)."""
+    """Return the numerical parts of a frame, as CasADi expressions of each class's parameters (n_p,)."""
 
     def values(function: Any, peer_class: PeerClass) -> list[Any]:
-        """Return the nonzeros of a function at a group's parameters, with zeros for all other arguments."""
+        """Return the nonzeros of a function at a class's parameters, with zeros for all other arguments."""
         other_arguments = [casadi.DM.zeros(*function.size_in(index)) for index in range(function.n_in() - 2)]
         return [
             _constant_or_expression(nonzero)
@@ -138,7 +138,7 @@ def _numbers(vector: Callable[[PeerClass], Any]) -> FrameNumbers:
         ]
 
     def subsystem(peer_class: PeerClass) -> LinearSubsystem:
-        """Return the matrices of a group of peers."""
+        """Return the matrices of a peer class."""
         return subsystem_of_entries(
             peer_class.jacobians, values(peer_class.jacobians.function, peer_class), 0
         )

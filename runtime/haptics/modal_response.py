@@ -1,7 +1,7 @@
 """The steady response of each mode of a model to a force e^{st} on its devices.
 
 Takes: peers with a device each, as loops.
-Gives: `DrivenPeer`, `driven_subsystem`; `DrivenMode`, `driven_mode`; `spectra`; `force_columns`.
+Gives: `DrivenPeer`, `driven_class_of`; `DrivenMode`, `driven_mode`; `spectra`; `force_columns`.
 Guarantees: the force and the motion are not sampled: every tick, hold and packet acts at its instant, and the
 response at s and at s + 2πjk/T, T a frame, is exact up to rounding, which is bounded.
 Does not: compose the responses of peers (see `peer_responses`).
@@ -98,7 +98,7 @@ class DrivenMode:
     frame: Fraction
 
 
-def driven_subsystem(peer_class: PeerClass, device: Device | None) -> tuple[PeerClass, DrivenPeer]:
+def driven_class_of(peer_class: PeerClass, device: Device | None) -> tuple[PeerClass, DrivenPeer]:
     """Return a class of peers with increments of its states as inputs, and readings of states and holds."""
     schedule = peer_class.schedule
     starts, seconds = _intervals(schedule)
@@ -133,8 +133,8 @@ def driven_subsystem(peer_class: PeerClass, device: Device | None) -> tuple[Peer
     if device is not None:
         push[0, device.velocity] = float(device.inverse)
         push[1, device.velocity] = UNIT_ROUNDOFF * abs(float(device.inverse))
-    peer_group = peer_class.with_subsystem(subsystem, exact, full, lifted)
-    return peer_group, DrivenPeer(
+    driven_class = peer_class.with_subsystem(subsystem, exact, full, lifted)
+    return driven_class, DrivenPeer(
         peer_class=peer_class,
         device=device,
         a=rounded(peer_class.subsystem.a, COEFFICIENT_ROUNDINGS),
@@ -163,7 +163,7 @@ def driven_mode(modal_system: ModalSystem, subsystems: Mapping[int, DrivenPeer])
     Parameters
     ----------
     modal_system, subsystems
-        The loop of classes from `driven_subsystem`, and their driven peers by the index of the class.
+        The loop of classes from `driven_class_of`, and their driven peers by the index of the class.
     """
     closed = close_loop(modal_system)
     driven_peers = [subsystems[peer_class.index] for peer_class in modal_system.peer_classes]

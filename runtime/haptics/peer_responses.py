@@ -25,7 +25,7 @@ from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.language.vectors import whole_and_index
 from apc.haptics.device_port import DevicePort
-from apc.haptics.modal_response import DrivenMode, driven_mode, driven_subsystem, spectra
+from apc.haptics.modal_response import DrivenMode, driven_class_of, driven_mode, spectra
 from apc.lifting.devices import LOCAL_MASS, Device, coupled_directly, find_device, find_devices
 from apc.lifting.interval_arithmetic import MIDPOINT_RADIUS, UNIT_ROUNDOFF, with_error_radius
 from apc.lifting.numeric_model import NumericModel
@@ -91,9 +91,9 @@ def responses(numeric: NumericModel, port: DevicePort, other: DevicePort) -> Res
             )
             device = result if isinstance(result, Device) else None
         _check_increments(model, peer_class)
-        peer_group, subsystem = driven_subsystem(peer_class, device)
-        driven_classes.append(peer_group)
-        subsystems[peer_group.index] = subsystem
+        driven_class, subsystem = driven_class_of(peer_class, device)
+        driven_classes.append(driven_class)
+        subsystems[driven_class.index] = subsystem
     plain, driven_loops = (
         accepted_loops(classes, comm_graph, _are_by_class, "apc transparency")[0]
         for classes in (peer_classes, driven_classes)

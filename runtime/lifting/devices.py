@@ -514,9 +514,9 @@ def without_hands(model: Model, option: str) -> Model:
         for peer_type in model.peer_types
     )
     bare = tuple(item or peer_type for item, peer_type in zip(peer_types, model.peer_types, strict=True))
-    compiled_system = replace(model, peer_types=bare)
-    refuse_hands(compiled_system, option)
-    return compiled_system
+    compiled_model = replace(model, peer_types=bare)
+    refuse_hands(compiled_model, option)
+    return compiled_model
 
 
 @functools.lru_cache(maxsize=64)
@@ -589,18 +589,18 @@ def with_hands(model: Model, hands: str) -> Model:
     if hands in (FREE, PASSIVE):
         return model
     if hands == CLAMPED:
-        compiled_system, name = clamped(model, option=option), "devices clamped"
+        compiled_model, name = clamped(model, option=option), "devices clamped"
     elif hands in HANDS:
-        compiled_system, name = gripped(model, option=option), "devices held"
+        compiled_model, name = gripped(model, option=option), "devices held"
     else:
         typical = {name: numbers[2] for name, numbers in published(hands).items()}
-        compiled_system, name = gripped(model, option=option), f"hands {hands}"
-        compiled_system = apply(
-            compiled_system,
-            [parse_override(compiled_system, f"{name}={value}") for name, value in typical.items()],
+        compiled_model, name = gripped(model, option=option), f"hands {hands}"
+        compiled_model = apply(
+            compiled_model,
+            [parse_override(compiled_model, f"{name}={value}") for name, value in typical.items()],
         )
     return replace(
-        compiled_system, name=f"{model.name}, {name}", origin=model.origin.after((HANDS_CHANGE, hands))
+        compiled_model, name=f"{model.name}, {name}", origin=model.origin.after((HANDS_CHANGE, hands))
     )
 
 

@@ -21,7 +21,8 @@ from apc.linearization.linearize import InitialReception, start_sends, start_val
 from apc.parameter_values.exact_arithmetic import evaluate_exact
 from apc.timing.communication_graph import check_mean
 
-# The gain of a receive for each sender's channel, by (edge, channel): one for all senders, or one per group.
+# The gain of a receive for each sender's channel, by (edge, channel): one for all senders, or one
+# per sending class.
 Gains = Mapping[tuple[str, str], tuple[Fraction, ...]]
 
 

@@ -115,10 +115,10 @@ def build_reception(
         schedules_per_tick[schedule, group.peer_type]
         for schedule, group in zip(schedules, model.groups, strict=True)
     )
-    shifted_system = replace(
+    shifted_model = replace(
         model, timings=tuple(replace(timing, value=timings[timing.name]) for timing in model.timings)
     )
-    peer_classes, comm_graph = lifted_classes(replace(numeric, model=shifted_system, given_schedules=by_tick))
+    peer_classes, comm_graph = lifted_classes(replace(numeric, model=shifted_model, given_schedules=by_tick))
     rows = {
         peer_class.index: schedules[comm_graph.group_of(peer_class.peers.first)].selected
         for peer_class in peer_classes

@@ -103,8 +103,8 @@ def forced(model: Model, reception: PerTickReception, first: Fraction = Fraction
         )
         if isinstance(device, str):
             raise NotSupportedError(device)
-        forced_group, peers[peer_class.index] = _forced(peer_class, device, ticks, -first % reception.frame)
-        peer_classes.append(forced_group)
+        forced_class, peers[peer_class.index] = _forced(peer_class, device, ticks, -first % reception.frame)
+        peer_classes.append(forced_class)
     if not any(peer.input_slots for peer in peers.values()):
         raise NotSupportedError("no peer has a device besides its object copies")
     return Forced(replace(reception, peer_classes=tuple(peer_classes)), peers)
@@ -113,8 +113,8 @@ def forced(model: Model, reception: PerTickReception, first: Fraction = Fraction
 def _forced(
     peer_class: PeerClass, device: Device | None, ticks: Sequence[Fraction], start: Fraction
 ) -> tuple[PeerClass, PeerReadings]:
-    """Return a group with a force input at its device, new values at each frame, and readings of its copies'
-    positions.
+    """Return a peer class with a force input at its device, new values at each frame, and readings of the
+    positions of its copies.
 
     Parameters
     ----------

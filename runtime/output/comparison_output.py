@@ -196,10 +196,10 @@ def _limit_cells(scheme: Scheme, key: str, feet: dict[str, int]) -> tuple[str, s
         )
     if critical.groups:
         remarks.append("varied as one value for all groups, whose values differ")
-    return _marked(_reach(critical), remarks, feet), critical.parameter
+    return _marked(_critical_text(critical), remarks, feet), critical.parameter
 
 
-def _reach(critical: Critical) -> str:
+def _critical_text(critical: Critical) -> str:
     """Return in words how far a model is stable."""
     if critical.value is None:
         assert critical.verdict is not None

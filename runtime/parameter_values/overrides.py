@@ -128,7 +128,7 @@ def apply(model: Model, overrides: Sequence[Override]) -> Model:
                 ),
             )
         )
-    compiled_system = replace(
+    compiled_model = replace(
         model,
         origin=model.origin.after(*((override.free.label, str(override.value)) for override in overrides)),
         parameters=tuple(
@@ -140,9 +140,9 @@ def apply(model: Model, overrides: Sequence[Override]) -> Model:
         experiment=_changed_experiment(model, common),
     )
     if counts:
-        compiled_system = recounted(compiled_system, counts, OVERRIDE)
-    _check_bounds(compiled_system)
-    return compiled_system
+        compiled_model = recounted(compiled_model, counts, OVERRIDE)
+    _check_bounds(compiled_model)
+    return compiled_model
 
 
 def _changed_counts(model: Model, common_values: Mapping[str, Fraction]) -> dict[str, Fraction]:

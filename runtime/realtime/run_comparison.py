@@ -289,8 +289,8 @@ def _measured_link(model: Model, link: Link, arcs: Sequence[ArcRun]) -> Measured
     period = min(float(timing.value) for timing in timings if timing.name in periods)
     measured_link = replace(traced(link, came.delays), pairs=pairs)
     links = tuple(measured_link if item is link else item for item in model.links)
-    measured_system = replace(model, timings=timings, links=links)
+    measured_model = replace(model, timings=timings, links=links)
     too_long = came.longest > LATEST * period or came.packets > LONGEST
-    network = None if too_long else mean_square_stability(numeric_model(measured_system))
+    network = None if too_long else mean_square_stability(numeric_model(measured_model))
     arc = f"{worst.sender} to {worst.receiver}"
-    return MeasuredLink(link.name, arc, float(delay), analyze(numeric_model(measured_system)), network)
+    return MeasuredLink(link.name, arc, float(delay), analyze(numeric_model(measured_model)), network)

@@ -40,7 +40,7 @@ from apc.studies.evaluator_choice import EvaluatorKind, kind_for_parameter
 from apc.studies.frame_matrices import batch_evaluator
 from apc.studies.parameter_path import MatrixPath
 from apc.studies.stability_criteria import NOMINAL, RadiusEvaluator
-from apc.studies.timing_values import system_with_delay
+from apc.studies.timing_values import model_with_time
 
 Floats = NDArray[np.float64]
 
@@ -174,7 +174,7 @@ def _delay_strips(
             yield _delay_independent_strip(segment, other, ends, numeric)
         return
     # An oversized problem is refused before any strip is analyzed.
-    longest = system_with_delay(model, delay.free, delay.high)
+    longest = model_with_time(model, delay.free, delay.high)
     evaluator_of_many(numeric.at(longest), [other.free], LOCATION)
     report_progress = delay_progress(
         model, delay.free, delay.low, delay.high, location=LOCATION, progress=progress

@@ -107,7 +107,7 @@ _Work = tuple[Model, tuple[Range, Range], int]
 
 
 def compare_regions(
-    systems: Sequence[Model],
+    models: Sequence[Model],
     *,
     x: str | None = None,
     y: str | None = None,
@@ -122,7 +122,7 @@ def compare_regions(
 
     Parameters
     ----------
-    systems
+    models
         The models; the `studies: region:` of the first gives axes that are not named.
     x, y
         The axes, see `axes.parse_axes`.
@@ -146,10 +146,10 @@ def compare_regions(
     jobs: list[tuple[str, list[_Work], list[Any]]] = []
     for settings in panels:
         prepared_models: list[_Work] = []
-        for index, original in enumerate(systems):
+        for index, original in enumerate(models):
             model = apply(original, [parse_override(original, text) for text in settings])
-            if index and len(systems[0].region) == 2:
-                model = replace(model, region=systems[0].region)
+            if index and len(models[0].region) == 2:
+                model = replace(model, region=models[0].region)
             axes = parse_axes(model, x, y)
             _refuse_setting_of_axis(axes, model, settings)
             gain = gain_factor(model, axes[1]) if normalize else 1

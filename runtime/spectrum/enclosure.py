@@ -119,13 +119,13 @@ def enclose_stack(matrix: Matrix, error: Floats) -> tuple[Eigenpairs, Enclosure]
         bounds = _bounds(matrix, error, pairs, pairs.left, values)
         width = bounds.high - bounds.low
         for row in np.flatnonzero(~(width <= SHARP * np.maximum(bounds.low, 1.0))).tolist():
-            repeated, tighter = _enclose_split(matrix[row : row + 1], error[row : row + 1])
+            repeated, tighter = _enclose_with_subspace(matrix[row : row + 1], error[row : row + 1])
             values[row], right[row], pairs.left[row] = repeated.values[0], repeated.right[0], repeated.left[0]
             bounds.low[row], bounds.high[row], bounds.errors[row] = tighter.low, tighter.high, tighter.errors
     return pairs, bounds
 
 
-def _enclose_split(matrix: Matrix, error: Floats) -> tuple[Eigenpairs, Enclosure]:
+def _enclose_with_subspace(matrix: Matrix, error: Floats) -> tuple[Eigenpairs, Enclosure]:
     """Return an enclosure for one matrix (1, n, n), with one invariant subspace for all small eigenvalues."""
     scale = balance(np.abs(matrix[0]) + error[0])
     units = scale / scale[:, None]

@@ -1,6 +1,6 @@
 """Test of the equilibrium at the start of a model that is linearized there.
 
-Takes: groups of peers with their receptions at the start.
+Takes: peer classes with their receptions at the start.
 Gives: `equilibrium_residual`.
 Guarantees: rounding errors of balanced forces are not reported.
 Does not: find an equilibrium, or simulate (see `simulation`).
@@ -35,14 +35,14 @@ def equilibrium_residual(peer_classes: Sequence[PeerClass]) -> str:
     Parameters
     ----------
     peer_classes
-        All peers of the topology; a group that is linear on its side of a kink is left out.
+        All peers of the topology; a class that is linear on its side of a kink is left out.
     """
-    linearized_groups = [
+    linearized_classes = [
         peer_class for peer_class in peer_classes if peer_class.initial_reception is not None
     ]
     quantities = [
         quantity
-        for peer_class in linearized_groups
+        for peer_class in linearized_classes
         for quantity in _unbalanced_quantities(peer_class, named=len(peer_classes) > 1)
     ]
     for unit in FORCES:
@@ -62,7 +62,7 @@ def _unbalanced_quantities(peer_class: PeerClass, *, named: bool) -> list[tuple[
     """Return the unbalanced quantities of a class at the start: magnitude, unit, and part or state.
 
     A quantity is a force on a part: the output of a hold that changes the state at the same rate. Without
-    such a hold it is the rate of the state. `named` states that names begin with that of the group.
+    such a hold it is the rate of the state. `named` states that names begin with that of the class.
     """
     assert peer_class.initial_reception is not None, "linearized where it starts"
     peer_type, subsystem, p = (

@@ -1,7 +1,7 @@
 """Equal peers on any graph, r = W s: one loop for each eigenvalue of W.
 
-Takes: a group of equal peers, the graph common to all their coupling terms, an eigenvalue of its W.
-Gives: `common_graph`, `GraphScale`, `graph_scale`, `graph_loop`.
+Takes: a class of equal peers, the graph common to all their coupling terms, an eigenvalue of its W.
+Gives: `reason_without_common_graph`, `GraphScale`, `graph_scale`, `graph_loop`.
 Guarantees: exact weights where the eigenvalue is rational; else an error bound, and the closed form.
 Does not: compute the eigenvalues of W (see `graph_modes`).
 
@@ -25,7 +25,9 @@ from apc.timing.communication_graph import CommunicationGraph, check_mean
 from apc.timing.schedule import CouplingTerm
 
 
-def common_graph(coupling_terms: Sequence[CouplingTerm], comm_graph: CommunicationGraph) -> str:
+def reason_without_common_graph(
+    coupling_terms: Sequence[CouplingTerm], comm_graph: CommunicationGraph
+) -> str:
     """Return the reason why the weight matrices of the links have different eigenvectors, "" if they are
     common.
     """

@@ -1,6 +1,6 @@
 """Interconnection: received values are sums of sent values, and one matrix maps the state of all subsystems.
 
-Takes: groups of equal peers, and their weights for each other's packets.
+Takes: peer classes, and their weights for each other's packets.
 Gives: `ModalSystem`, `Coupling`, `without_packets`; `DelayedSample`, `StateLayout`, `lay_out`; `ClosedLoop`,
 `close_loop`; `InterconnectionMatrices`, `bounded_weight`, `feedback_of`, `interconnect`,
 `interconnect_with_inputs`; `lay_out_loop`.

@@ -1,6 +1,6 @@
 """Modal decomposition: a complete system as few and small independent loops.
 
-Takes: the groups of equal peers of a model, and the links between them.
+Takes: the peer classes of a model, and the links between them.
 Gives: `split`; `ModalDecomposition`, `decompose`; `accepted_loops`, `orthogonal_loops`; `complete_loops`,
 `dense_loop`, `dense`, `refuse_dense`, `split_exchangeable`; `couple`, `complete_degrees`.
 Guarantees: the systems of a split, each with its multiplicity, have together the spectrum of `dense`, for any
@@ -8,11 +8,11 @@ number of peers. Weights are exact; a mean over no peers, or with weights that s
 Does not: compute eigenvalues (see `spectrum`); find symmetries of different peers other than a permutation of
 two.
 
-On a complete graph a peer of group g receives r = c_g (Σ_j s_j − s_own), with c_g = 1/(others) for a mean and
+On a complete graph a peer of class g receives r = c_g (Σ_j s_j − s_own), with c_g = 1/(others) for a mean and
 1 for a sum. K groups of n_1 … n_K equal peers then split exactly:
 
-    common        all peers of a group in phase: r_g = c_g Σ_h (n_h − δ_gh) s_h         once
-    difference g  peers of group g with sum zero, all others at rest: r_g = −c_g s_g     n_g − 1 times
+    common        all peers of a class in phase: r_g = c_g Σ_h (n_h − δ_gh) s_h         once
+    difference g  peers of class g with sum zero, all others at rest: r_g = −c_g s_g     n_g − 1 times
 
 For equal peers on any other graph see `graph_loops`. Different peers on such a graph are one system, reduced
 by interchangeable peers: g and h of equal dynamics whose weights to and from all others are equal. A class c
@@ -31,7 +31,7 @@ from fractions import Fraction
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.weights import exact_weight
 from apc.lifting.model_numbers import PeerIndices
-from apc.spectrum.graph_loops import common_graph, graph_loop, graph_scale
+from apc.spectrum.graph_loops import graph_loop, graph_scale, reason_without_common_graph
 from apc.spectrum.graph_modes import graph_modes
 from apc.spectrum.interconnection import ClosedLoop, Coupling, ModalSystem, close_loop
 from apc.spectrum.peer_classes import (
@@ -61,7 +61,7 @@ class ModalDecomposition:
 
 
 def split(peer_classes: Sequence[PeerClass], comm_graph: CommunicationGraph) -> tuple[ClosedLoop, ...]:
-    """Return the complete system as the smallest closed loops that its graphs and groups allow.
+    """Return the complete system as the smallest closed loops that its graphs and peer classes allow.
 
     Parameters
     ----------
@@ -96,7 +96,9 @@ def decompose(peer_classes: Sequence[PeerClass], comm_graph: CommunicationGraph)
         return ModalDecomposition("modes", complete_loops(peer_classes, comm_graph), ())
     named = " and ".join(f"{link} ({comm_graph.links[link].graph.shape})" for link in graphs)
     reason = (
-        f"the peers on {named} differ" if len(peer_classes) > 1 else common_graph(coupling_terms, comm_graph)
+        f"the peers on {named} differ"
+        if len(peer_classes) > 1
+        else reason_without_common_graph(coupling_terms, comm_graph)
     )
     if not reason:
         scale = graph_scale(peer_classes[0], coupling_terms, comm_graph)
@@ -184,7 +186,7 @@ def orthogonal_loops(
 def complete_loops(
     peer_classes: Sequence[PeerClass], comm_graph: CommunicationGraph
 ) -> tuple[ModalSystem, ...]:
-    """Return a common loop, and a difference loop for each group of two or more peers, on complete graphs.
+    """Return a common loop, and a difference loop for each class of two or more peers, on complete graphs.
 
     Parameters
     ----------
@@ -362,7 +364,7 @@ def _class_weight(
 
 
 def _merged_class(peer_classes: Sequence[PeerClass], comm_graph: CommunicationGraph) -> PeerClass:
-    """Return equal subsystems as one class of peers."""
+    """Return equal peer classes as one."""
     peers = PeerIndices(tuple(run for peer_class in peer_classes for run in peer_class.peers.runs))
     return replace(peer_classes[0], name=group_name(peers, comm_graph), count=len(peers), peers=peers)
 
@@ -432,7 +434,7 @@ def couple(
 def complete_degrees(
     peer_classes: Sequence[PeerClass], comm_graph: CommunicationGraph
 ) -> dict[tuple[str, int], Fraction]:
-    """Return the number of other peers from which a peer of each group receives, for each complete link."""
+    """Return the number of other peers from which a peer of each class receives, for each complete link."""
     degrees = {}
     for link in comm_graph.links:
         total = sum(peer_class.count for peer_class in peer_classes if peer_class.sends(link))

@@ -334,7 +334,10 @@ def _solve_in_floats(closed_loop: ClosedLoop, rigid_modes: RigidModes) -> _Solve
 
 
 def _solve_in_balls(closed_loop: ClosedLoop, estimate: _SolvedLoop) -> _SolvedLoop:
-    """Return the eigenvalues of one system, solved in balls; undecided parts keep the result of floats."""
+    """Return `estimate` with the bounds and the verdict that ball arithmetic proves.
+
+    The eigenpairs of the proof replace those of floats unless its discs are wider by `AS_SHARP`.
+    """
     proof = prove(closed_loop, estimate.rigid_modes)
     if proof.rigid_modes.drifts != estimate.rigid_modes.drifts:
         estimate = _solve_in_floats(closed_loop, proof.rigid_modes)
@@ -349,7 +352,7 @@ def _solve_in_balls(closed_loop: ClosedLoop, estimate: _SolvedLoop) -> _SolvedLo
         min(estimate.radius_excess[1], proof.radius_excess[1]),
     )
     proved = replace(estimate, low=low, high=high, inside=inside, bits=bits, radius_excess=radius_excess)
-    # A radius that floats bound as well; the proof bounds the other eigenvalues far better.
+    # The discs of the proof are wider than floats bound the radius: the eigenpairs of floats are kept.
     if enclosure.high - enclosure.low > AS_SHARP * (estimate.high - estimate.low):
         return proved
     order = descending(proof.centres)

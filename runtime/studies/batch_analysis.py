@@ -370,8 +370,8 @@ def _shared_matrices(
     parameter_refs = tuple(free[column] for column in columns)
     try:
         with finite_equations(numeric.model.origin.topology), np.errstate(all="ignore"):
-            timed_system = apply(numeric.model, timing_overrides)
-            generic_model = numeric.at(generic(timed_system, parameter_refs))
+            timed_model = apply(numeric.model, timing_overrides)
+            generic_model = numeric.at(generic(timed_model, parameter_refs))
             if not parameters_suffice(generic_model):
                 return None
             plan = make_plan(generic_model)
@@ -380,7 +380,7 @@ def _shared_matrices(
             if max(modal_system.states for modal_system in plan.loops) > BATCH_STATES:
                 return None
             evaluator = batch_evaluator(
-                timed_system, parameter_refs, plan.peer_classes, generic_model.comm_graph
+                timed_model, parameter_refs, plan.peer_classes, generic_model.comm_graph
             )
     except ApcError:
         return None  # each point reports its own error
@@ -392,15 +392,15 @@ def _shared_matrices(
         drifts += modal_system.multiplicity * wiring.rigid.drifts
     names = {item.name: column for column, item in zip(columns, parameter_refs, strict=True)}
     all_parameters = (
-        *timed_system.parameters,
-        *(value for group in timed_system.groups for value in group.values),
+        *timed_model.parameters,
+        *(value for group in timed_model.groups for value in group.values),
     )
     parts, patterns = parts_of(evaluator)
     return _SharedMatrices(
-        model=timed_system,
+        model=timed_model,
         evaluator=evaluator,
         columns=columns,
-        reaching=_dependency_groups(timed_system, columns, parameter_refs),
+        reaching=_dependency_groups(timed_model, columns, parameter_refs),
         rigid=rigid,
         drifts=drifts,
         bounds=tuple(

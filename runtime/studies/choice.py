@@ -32,12 +32,12 @@ class SweepChoice:
     why: str = ""
 
 
-def check_over(systems: Sequence[Model], over: Iterable[str]) -> None:
+def check_over(models: Sequence[Model], over: Iterable[str]) -> None:
     """Raise ApcError for a name that is unknown to all models, or that is not a stiffness, delay or loss.
 
     Parameters
     ----------
-    systems
+    models
         The models.
     over
         The names given.
@@ -49,12 +49,12 @@ def check_over(systems: Sequence[Model], over: Iterable[str]) -> None:
     """
     for name in over:
         errors: list[ApcError] = []
-        for model in systems:
+        for model in models:
             try:
                 _axis(model, find(model, name, _LOCATION))
             except ApcError as error:
                 errors.append(error)
-        if len(errors) == len(systems):
+        if len(errors) == len(models):
             raise errors[0]
 
 

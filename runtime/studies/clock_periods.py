@@ -41,9 +41,9 @@ from apc.studies.timing_values import (
     delay_now,
     is_scaled,
     long_period_between,
+    model_with_time,
     period_between,
     periods_near,
-    system_with_delay,
 )
 from apc.verdict import ProofMethod, StabilityProof
 
@@ -73,7 +73,7 @@ def period_segments(model: Model, axis: Range, location: SourceLocation) -> Iter
     values = periods_near(model, axis.free, [axis.low + step * k for k in range(STRIPS + 1)], location)
     middles = [(before + after) / 2 for before, after in itertools.pairwise(values)]
     for value, low, high in zip(values, [axis.low, *middles], [*middles, axis.high], strict=True):
-        yield DelaySegment(low, high, None, system_with_delay(model, axis.free, value))
+        yield DelaySegment(low, high, None, model_with_time(model, axis.free, value))
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,7 +154,7 @@ class PeriodPath(_AnyPeriodPath):
 
     def _verdict(self, value: Fraction) -> Verdict:
         """Return the verdict of the model with this value."""
-        return self.decide(system_with_delay(self.model, self.free, value))
+        return self.decide(model_with_time(self.model, self.free, value))
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,14 +174,14 @@ class NominalPeriodPath(_AnyPeriodPath):
         A drift counts as stable: it exists on both sides of a crossing. Exact arithmetic is
         limited to `EXACT_WORK`.
         """
-        changed = system_with_delay(self.model, self.free, value)
+        changed = model_with_time(self.model, self.free, value)
         try:
             if reaches_start(self.model, self.free):  # the kinks at the start depend on the period
                 analysis, _ = analyze_worst_side(sides(self.numeric.at(changed)), exact_work=EXACT_WORK)
             else:
                 ordered = self.sides
                 changed_sides = [
-                    replace(side, numeric=numeric.at(system_with_delay(numeric.model, self.free, value)))
+                    replace(side, numeric=numeric.at(model_with_time(numeric.model, self.free, value)))
                     for side in ordered
                     for numeric in [side.numeric]
                 ]

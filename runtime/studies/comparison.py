@@ -126,7 +126,7 @@ class SchemeComparison(Result):
 
 @part("compare")
 def compare(
-    systems: Sequence[Model],
+    models: Sequence[Model],
     *,
     over: Sequence[str] = (),
     criterion: str | None = None,
@@ -138,7 +138,7 @@ def compare(
 
     Parameters
     ----------
-    systems
+    models
         The models, with the parameter values to analyze.
     over
         The varied stiffness, delay and loss, for the models that have them: see `choice.choose`.
@@ -157,13 +157,13 @@ def compare(
     ApcError
         E940, E941 and E622, as in `choice`; E898 an unknown criterion.
     """
-    check_over(systems, over)
-    analyzed = {index: model for index, model in enumerate(systems) if index not in refused}
+    check_over(models, over)
+    analyzed = {index: model for index, model in enumerate(models) if index not in refused}
     for model in analyzed.values():
         criterion_of(model, criterion, SourceLocation("criterion"))
     chosen = {index: choose(model, over) for index, model in analyzed.items()}
     schemes = []
-    for index, model in enumerate(systems):
+    for index, model in enumerate(models):
         reason = refused.get(index, "")
         if not reason:
             try:

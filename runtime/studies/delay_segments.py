@@ -30,7 +30,7 @@ from apc.parameter_values.parameter_names import ParameterRef
 from apc.parameter_values.parameters import resolve
 from apc.spectrum.peer_classes import states_of
 from apc.studies.frame_matrices import BatchEvaluator, batch_evaluator
-from apc.studies.timing_values import STEP, delay_now, system_with_delay, timing_slopes
+from apc.studies.timing_values import STEP, delay_now, model_with_time, timing_slopes
 from apc.support.remaining_time import RemainingTime
 from apc.timing.schedule import HoldUpdate, Propagate, Schedule
 
@@ -202,7 +202,7 @@ def borders(
         raise _clock_time_error(parameter_ref, location)
     now = delay_now(model, parameter_ref)
     timings_at = [
-        resolve(system_with_delay(model, parameter_ref, now + share * STEP)).timings for share in (0, 1, 2)
+        resolve(model_with_time(model, parameter_ref, now + share * STEP)).timings for share in (0, 1, 2)
     ]
     slopes = timing_slopes(model, parameter_ref)
     if any(slopes[name] for name in fixed):
@@ -251,7 +251,7 @@ def borders(
 def reaches_parameters(model: Model, parameter_ref: ParameterRef) -> bool:
     """Return whether a number that affects delays is also an equation parameter, or affects one."""
     first, second = (
-        resolve(system_with_delay(model, parameter_ref, value)).parameters
+        resolve(model_with_time(model, parameter_ref, value)).parameters
         for value in (Fraction(1), Fraction(2))
     )
     return not all(np.array_equal(*pair) for pair in zip(first, second, strict=True))
@@ -289,7 +289,7 @@ def _segment(
     """
     model = numeric.model
     delay = low + INSIDE * (high - low)
-    inside = numeric.at(system_with_delay(model, parameter_ref, delay))
+    inside = numeric.at(model_with_time(model, parameter_ref, delay))
     durations: dict[int, tuple[float, float]] = {}
     for schedule, group in zip(inside.schedules, model.groups, strict=True):
         for quanta, slope in _duration_slopes(schedule, model.peer_types[group.peer_type], slopes).items():

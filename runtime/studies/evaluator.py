@@ -134,11 +134,11 @@ class PiecewiseEvaluator:
 
     def _evaluator_around(self, value: Floats) -> BatchEvaluator:
         """Return the evaluator of the points with the same rigid modes as the point `value` (m,)."""
-        system_at_value = apply(self.model, overrides_at(self.model, self.free, value.tolist()))
+        model_at_value = apply(self.model, overrides_at(self.model, self.free, value.tolist()))
         result = batch_evaluator(
-            system_at_value,
+            model_at_value,
             self.free,
-            *_lifted_anywhere(self.numeric.at(system_at_value), self.free),
+            *_lifted_anywhere(self.numeric.at(model_at_value), self.free),
         )
         return replace(
             result, wirings=tuple(map(loop_structure, result.closed))

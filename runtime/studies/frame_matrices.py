@@ -1,11 +1,11 @@
 """The frame matrices of a model for many values of its parameters, with their derivatives.
 
-Takes: groups of peers whose subsystems are affine, the links between them, and the parameters that vary.
+Takes: peer classes whose subsystems are affine, the links between them, and the parameters that vary.
 Gives: `MatrixSource`; `BatchEvaluator`, `batch_evaluator`; `Bounded`, `lifted_systems`, `is_too_large`.
 Guarantees: shared data is built once for all values; rigid modes are removed by their exact directions; a
 derivative is exact to rounding. A point with infinite matrices, or with other rigid modes than its
 neighbours, has the value NaN.
-Does not: choose the groups (see `evaluator`), or compute eigenvalues.
+Does not: choose the classes (see `evaluator`), or compute eigenvalues.
 
 Derivatives are complex steps, M′ = Im M(p + i h p′)/h, without cancellation for any small h (Squire and
 Trapp, SIAM Review 40, 1998), through the composition of the frame; CasADi differentiates the coefficients.
@@ -302,18 +302,18 @@ class BatchEvaluator:
         """Return a class's subsystems, their exponentials if constant, and the mask of points without
         exponentials.
         """
-        radius_excess = is_too_large(subsystem.a, subsystem.b)
+        too_large = is_too_large(subsystem.a, subsystem.b)
         if peer_class.index in self.fixed:
             return (
                 replace(subsystem, a=subsystem.a[:1], b=subsystem.b[:1]),
                 self.fixed[peer_class.index],
-                radius_excess,
+                too_large,
             )
-        subsystem.a[radius_excess], subsystem.b[radius_excess] = (
+        subsystem.a[too_large], subsystem.b[too_large] = (
             0.0,
             0.0,
         )  # infinite entries would also affect other points
-        return subsystem, {}, radius_excess
+        return subsystem, {}, too_large
 
     def steps(
         self, subsystem: LinearSubsystem, values: Matrices, arithmetic: Arithmetic
@@ -465,8 +465,8 @@ def lifted_systems(systems: Sequence[Wired]) -> tuple[Wired, ...]:
 def is_too_large(a: Matrices, b: Matrices) -> NDArray[np.bool_]:
     """Return the mask of the A and B that are too large, or not finite, for an exponential in floats."""
     size = np.abs(a).sum(axis=(1, 2)) + np.abs(b).sum(axis=(1, 2))
-    radius_excess: NDArray[np.bool_] = ~(size < LARGEST)
-    return radius_excess
+    too_large: NDArray[np.bool_] = ~(size < LARGEST)
+    return too_large
 
 
 def _set_invalid(frame: FrameMap, invalid: NDArray[np.bool_]) -> None:

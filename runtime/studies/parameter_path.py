@@ -31,7 +31,7 @@ from apc.studies.crossing import ESTIMATE, UNSURE, Crossing, SingleSegment, Smoo
 from apc.studies.delay_segments import INSIDE, DelaySegment, borders, delay_segments
 from apc.studies.dominant_eigenvalue import DrivingPart, dominant_at, parts_of
 from apc.studies.frame_matrices import BatchEvaluator
-from apc.studies.timing_values import delay_now, system_with_delay
+from apc.studies.timing_values import delay_now, model_with_time
 from apc.support.lazy import LazyTuple
 from apc.verdict import NO_PROOF, ProofMethod, StabilityProof, StabilityVerdict
 
@@ -272,7 +272,7 @@ class DelayPath(AnalyzedPath):
 
     def _verdict(self, value: Fraction) -> Verdict:
         """Return the verdict of an analysis at a delay; undecided if it is impossible."""
-        changed = system_with_delay(self.numeric.model, self.free, value)
+        changed = model_with_time(self.numeric.model, self.free, value)
         try:
             return verdict_of(analyze(self.numeric.at(changed)))
         except ApcError:
@@ -280,7 +280,7 @@ class DelayPath(AnalyzedPath):
 
     def _verdict_within(self, value: Fraction) -> Verdict:
         """Return the verdict at a delay inside a segment whose events depend on the delay."""
-        return analyzed(self.numeric, system_with_delay(self.numeric.model, self.free, value))
+        return analyzed(self.numeric, model_with_time(self.numeric.model, self.free, value))
 
     def smooth_segments(self) -> Iterator[SmoothSegment]:
         """Yield the start of the path, then the segments from one coincidence of events to the next."""
@@ -310,7 +310,7 @@ class DelayPath(AnalyzedPath):
         inside, inside_model
             The representative delay, and the model at this delay, if already computed.
         """
-        inside_model = inside_model or system_with_delay(self.numeric.model, self.free, inside)
+        inside_model = inside_model or model_with_time(self.numeric.model, self.free, inside)
         point, high = np.array([float(low)]), min(high, self.high)
 
         def verdict_at(_: Fraction) -> Verdict:

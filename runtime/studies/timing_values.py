@@ -1,7 +1,7 @@
 """The values of a time, and the clock periods with short frames.
 
 Takes: a `Model` and a timing, or a parameter that a timing depends on.
-Gives: `system_with_delay`, `delay_now`, `timing_slopes`; `reaches_period`, `refuse_phase`, `is_scaled`;
+Gives: `model_with_time`, `delay_now`, `timing_slopes`; `reaches_period`, `refuse_phase`, `is_scaled`;
 `nearest_period`, `periods_near`, `period_between`, `base_value`; `MOST_FRAME_TICKS`;
 `long_period_between`.
 Guarantees: exact rationals of a second.
@@ -38,7 +38,7 @@ RATES = ("Hz", "1/s")
 DIGITS, CACHE_SIZE = 9, 256
 
 
-def system_with_delay(model: Model, parameter_ref: ParameterRef, value: Fraction) -> Model:
+def model_with_time(model: Model, parameter_ref: ParameterRef, value: Fraction) -> Model:
     """Return the model with another value of the timing or of the parameter that affects timings."""
     return apply(model, [Override(parameter_ref, value)])
 
@@ -56,7 +56,7 @@ def timing_slopes(model: Model, parameter_ref: ParameterRef) -> Mapping[str, Fra
     """Return the slope of each timing with respect to a parameter or timing, by its name."""
     now = delay_now(model, parameter_ref)
     now_timings, shifted_timings = (
-        resolve(system_with_delay(model, parameter_ref, value)).timings for value in (now, now + STEP)
+        resolve(model_with_time(model, parameter_ref, value)).timings for value in (now, now + STEP)
     )
     return {name: (shifted_timings[name] - now_timings[name]) / STEP for name in now_timings}
 
@@ -98,7 +98,7 @@ def is_scaled(model: Model, parameter_ref: ParameterRef, *, delays: bool = False
     names = _clock_times(model, phases=False) | _clock_times(model, phases=True)
     first = model.clocks[0].period
     for value in (2 * now, now + STEP):
-        changed = resolve(system_with_delay(model, parameter_ref, value)).timings
+        changed = resolve(model_with_time(model, parameter_ref, value)).timings
         factor = changed[first] / timings[first]
         if any(changed[name] != factor * timings[name] for name in (timings if delays else names)):
             return False
@@ -108,7 +108,7 @@ def is_scaled(model: Model, parameter_ref: ParameterRef, *, delays: bool = False
 def _frame_ticks(model: Model, parameter_ref: ParameterRef, value: Fraction) -> float:
     """Return the number of ticks of all clocks in a frame at a value, infinite without a frame."""
     try:
-        timings = resolve(system_with_delay(model, parameter_ref, value)).timings
+        timings = resolve(model_with_time(model, parameter_ref, value)).timings
     except ApcError:  # beyond the bounds of the number
         return math.inf
     used = clocks_in_use(model)

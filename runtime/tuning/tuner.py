@@ -310,7 +310,7 @@ class _Tuner:
                 optimum = self._optimize_scenarios(objective.column, [self._shares(least_violation)])
             if objective.column is None and self.spec.decay < 1 and optimum.worst_case > BINDS:
                 return self._infeasible_result(optimum)
-            gains, proofs, violated = self._rounded_and_proved(optimum)
+            gains, proofs, violated = self._round_and_prove(optimum)
             if violated is None or self.timed_out:
                 return self._result(optimum, gains, proofs)
             self.scenarios.append(violated)
@@ -393,8 +393,13 @@ class _Tuner:
         self.scenarios += additions
         return bool(additions)
 
-    def _rounded_and_proved(self, optimum: Optimum) -> tuple[list[Fraction], list[Proved], Scenario | None]:
-        """Return decimal gains, their proofs, and a scenario in which they are proved unstable, if any."""
+    def _round_and_prove(self, optimum: Optimum) -> tuple[list[Fraction], list[Proved], Scenario | None]:
+        """Return decimal gains near an optimum, their proofs, and a scenario in which they are proved
+        unstable, if any.
+
+        The objective is relaxed by one step of `BACK` after another until the gains are proved; those of the
+        last step are returned without a proof.
+        """
         column = self.spec.objective.column
         all_relaxations: tuple[float, ...] = BACK if self._unproved or not self.spec.over else BACK_IN_BOX
         if column is None:
@@ -409,7 +414,7 @@ class _Tuner:
                 and not self.timed_out
                 and self._add_scenarios(np.array(gains, np.float64), -ABOVE)
             ):
-                continue
+                continue  # the same relaxation again, with the violated scenarios
             satisfied = column is None or float(self._worst_cases(gains).max()) < 0
             last = self.timed_out or len(relaxations) == 1
             if satisfied or last:

@@ -19,7 +19,7 @@ from apc.parameter_values.parameter_names import ParameterRef
 from apc.spectrum import spectrum
 from apc.studies.clock_periods import NominalPeriodPath
 from apc.studies.parameter_path import LOCATION
-from apc.studies.timing_values import system_with_delay
+from apc.studies.timing_values import model_with_time
 from tests.language.own import component
 from tests.topologies import TOPOLOGIES, compiled, library, messages_of
 
@@ -412,7 +412,7 @@ def test_an_unstable_side_decides_a_long_frame_without_proofs(monkeypatch: pytes
     """Over 382 ticks floats leave three of four sides undecided; the fourth is unstable, also in balls."""
     model = apc.compile(str(TOPOLOGIES / "two-users-passivity.yaml"))
     period, value = ParameterRef("haptic.period"), Fraction(1, 9425)
-    changed = system_with_delay(model, period, value)
+    changed = model_with_time(model, period, value)
     *_, inactive = sides(numeric_model(changed))
     truth = analyze(inactive.numeric, certify=True)
     assert truth.stable is False and truth.proof.bits > 0

@@ -13,7 +13,7 @@ from apc.compiler.compiled import Model
 from apc.lifting.numeric_model import numeric_model
 from apc.parameter_values.overrides import apply, parse_override
 from apc.parameter_values.parameter_names import ParameterRef
-from apc.studies.timing_values import system_with_delay
+from apc.studies.timing_values import model_with_time
 from tests.topologies import AVERAGE, compiled, replaced
 from tests.varying.closed_forms import built
 
@@ -88,8 +88,7 @@ def test_beside_another_clock_the_error_is_the_gap_between_periods(period: str) 
     for side, stable in ((-1, True), (1, False)):
         end = Fraction((one.value + side * one.error) / float(unit)).limit_denominator(400) * unit
         assert (
-            analyze(numeric_model(system_with_delay(model, ParameterRef("tick.period"), end))).stable
-            is stable
+            analyze(numeric_model(model_with_time(model, ParameterRef("tick.period"), end))).stable is stable
         )
 
 

@@ -115,8 +115,11 @@ def _burst_growth(numeric: NumericModel, first: Fraction | None) -> StabilityMea
 
     Parameters
     ----------
-    numeric, first
-        As for `_independent_growth`.
+    numeric
+        The model with its parameter values.
+    first
+        The nominal arrival time in a frame, in seconds, if receivers substitute their own value; None if they
+        keep the last one.
     """
     model = numeric.model
     reception = build_reception(numeric, first=first or Fraction(0), stand_in=first is not None)

@@ -123,7 +123,7 @@ def worst_case(numeric: NumericModel) -> ConsecutiveLosses:
 
 
 def worst_trace(model: Model) -> Model:
-    """Return a system whose unreliable links lose packets by the destabilizing pattern, periodically.
+    """Return a model whose unreliable links lose packets by the destabilizing pattern, periodically.
 
     Parameters
     ----------

@@ -249,7 +249,7 @@ def weight_of(loops: Sequence[ModalSystem], lossy: frozenset[str]) -> tuple[floa
             ]
             if not blocks:
                 continue
-            units = _units(np.sum(blocks, axis=0))
+            units = _balancing_units(np.sum(blocks, axis=0))
             sizes |= {
                 (link, peer_class.name): unit
                 for peer_class, unit in zip(modal_system.peer_classes, units.tolist(), strict=True)
@@ -259,7 +259,7 @@ def weight_of(loops: Sequence[ModalSystem], lossy: frozenset[str]) -> tuple[floa
     return largest * (1 + NORM_ROUNDINGS * UNIT_ROUNDOFF), sizes
 
 
-def _units(weights: Floats) -> Floats:
+def _balancing_units(weights: Floats) -> Floats:
     """Return the scaling with the smallest norm of a weight matrix; 1 if some peers receive nothing."""
     result = []
     for matrix in (weights, weights.T):

@@ -90,11 +90,11 @@ def _loop_gain(numeric: NumericModel, delay: ParameterRef, low: Fraction, high: 
     ):
         raise NotSupportedError("receivers use the age of packets, or the previous packet")
     links = tuple(replace(item, channel=HOLDING) if item is link else item for item in middle.links)
-    varying_system = replace(middle, links=links)
-    reception = build_reception(numeric.at(varying_system))
-    refuse_unheld(varying_system, reception)
+    varying_model = replace(middle, links=links)
+    reception = build_reception(numeric.at(varying_model))
+    refuse_unheld(varying_model, reception)
     loops = orthogonal_loops(reception.peer_classes, reception.comm_graph, GAIN_BOUND_STATES)
-    packets = Packets(varying_system, reception)
+    packets = Packets(varying_model, reception)
     lossy = frozenset(link.name for link in links if link.channel is not None)
     ratios, (weight, sizes) = ratios_of(loops[0].peer_classes, lossy), weight_of(loops, lossy)
     received = {row: packets.received(row)[0] for row in packets.rows}

@@ -21,7 +21,7 @@ from apc.compiler.errors import ApcError, Diagnostic
 from apc.lifting.numeric_model import numeric_model
 from apc.parameter_values.parameter_names import Range
 from apc.studies.representative_delays import LOCATION, is_delay, representative_delays
-from apc.studies.timing_values import system_with_delay
+from apc.studies.timing_values import model_with_time
 from apc.support.extension_table import find_extension, not_installed
 from apc.support.not_supported import NotSupportedError
 from apc.verdict import Term
@@ -69,7 +69,7 @@ def prove_over_delay(
     verdict: Term = UNDECIDED
     open_point: tuple[float, ...] = ()
     for value, share in representative_delays(model, delay):
-        proof = prove(system_with_delay(model, delay.free, value), other_ranges)
+        proof = prove(model_with_time(model, delay.free, value), other_ranges)
         cells += proof.cells
         point = (*proof.counterexample[:index], float(value), *proof.counterexample[index:])
         if proof.stable is False:

@@ -77,7 +77,7 @@ class _BoxProblem:
     ranges: tuple[Range, ...]
     local: tuple[int, ...]  # the indices of the ranges of peer parameters
     classes: Classes
-    subsystems: tuple[LinearSubsystem, ...]  # of all groups of peers, over `Fraction` and `Ratio`
+    subsystems: tuple[LinearSubsystem, ...]  # of all peer classes, over `Fraction` and `Ratio`
     frames: ParametricFrames
     indices: Mapping[str, int]  # the index in `subsystems` of each subsystem of a loop, by its name
     wide: ModalSystem  # the loop of all classes, with frame maps over the box
@@ -138,7 +138,7 @@ def _box_problem(model: Model, ranges: Sequence[Range]) -> _BoxProblem:
     numeric = numeric_model(model)
 
     def lifted(changed: Model) -> Any:
-        """Return the groups and links of a model with a row of r for each tick."""
+        """Return the peer classes and the communication graph of a model with a row of r for each tick."""
         result = build_reception(numeric.at(changed))
         return result.peer_classes, result.comm_graph
 

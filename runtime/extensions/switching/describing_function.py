@@ -72,15 +72,15 @@ def load_of(bias: float) -> float:
     return (math.sqrt(1 - bias * bias) + bias * (math.pi / 2 + math.asin(bias))) / math.pi
 
 
-def predict(model: Model, groups: list[tuple[PeerClass, tuple[SectorNonlinearity, ...]]]) -> Predicted:
+def predict(model: Model, with_contacts: list[tuple[PeerClass, tuple[SectorNonlinearity, ...]]]) -> Predicted:
     """Return the limit cycle of a model that the describing function predicts.
 
     Parameters
     ----------
     model
         The compiled model.
-    groups
-        From `lure_form.contact_groups`.
+    with_contacts
+        From `lure_form.contact_classes`.
 
     Raises
     ------
@@ -91,7 +91,7 @@ def predict(model: Model, groups: list[tuple[PeerClass, tuple[SectorNonlinearity
 
     def spectrum_at(gain: float) -> Spectrum:
         """Return the spectrum of the loop with linear contacts of this share of their stiffness."""
-        return _spectrum(groups, comm_graph, gain)
+        return _spectrum(with_contacts, comm_graph, gain)
 
     def excess(gain: float) -> float:
         """Return the excess over 1 of the spectral radius with linear contacts of this share of their
@@ -118,12 +118,12 @@ def predict(model: Model, groups: list[tuple[PeerClass, tuple[SectorNonlinearity
 
 
 def _spectrum(
-    groups: list[tuple[PeerClass, tuple[SectorNonlinearity, ...]]],
+    with_contacts: list[tuple[PeerClass, tuple[SectorNonlinearity, ...]]],
     comm_graph: CommunicationGraph,
     gain: float,
 ) -> Spectrum:
     """Return the spectrum of the model with linear contacts of a reduced stiffness."""
-    scaled_groups = [with_gain(peer_class, forces, Fraction(gain)) for peer_class, forces in groups]
+    scaled_classes = [with_gain(peer_class, forces, Fraction(gain)) for peer_class, forces in with_contacts]
     return solve_spectrum(
-        [close_loop(modal_system) for modal_system in decompose(scaled_groups, comm_graph).loops]
+        [close_loop(modal_system) for modal_system in decompose(scaled_classes, comm_graph).loops]
     )

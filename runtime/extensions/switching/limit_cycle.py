@@ -25,7 +25,7 @@ from apc.compiler.compiled import LENGTH, Model
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.timings import part
 from apc.extensions.switching.describing_function import Predicted, predict
-from apc.extensions.switching.lure_form import contact_groups
+from apc.extensions.switching.lure_form import contact_classes
 from apc.extensions.switching.sector_nonlinearity import SectorNonlinearity
 from apc.lifting.numeric_model import NumericModel
 from apc.parameter_values.parameters import resolve
@@ -142,19 +142,19 @@ def limit_cycle(
     """
     model = numeric.model
     try:
-        groups = contact_groups(numeric)
+        with_contacts = contact_classes(numeric)
     except NotSupportedError as why:
         raise _no_limit_cycle(model, str(why)) from None
-    if not any(forces for _, forces in groups):
+    if not any(forces for _, forces in with_contacts):
         raise _no_limit_cycle(model, "no contact is closed")
-    for _, forces in groups:
+    for _, forces in with_contacts:
         for push in forces:
             if not push.unilateral:
                 raise _no_limit_cycle(model, f"{push.part} also pulls, or is limited")
-    contacts = _contacts(model, groups)
+    contacts = _contacts(model, with_contacts)
     predicted, reason = None, ""
     try:
-        predicted = predict(model, groups)
+        predicted = predict(model, with_contacts)
     except NotSupportedError as why:
         reason = str(why)
     seconds = _duration(model)
@@ -185,14 +185,14 @@ def _no_limit_cycle(model: Model, why: str) -> ApcError:
 
 
 def _contacts(
-    model: Model, groups: Sequence[tuple[PeerClass, tuple[SectorNonlinearity, ...]]]
+    model: Model, with_contacts: Sequence[tuple[PeerClass, tuple[SectorNonlinearity, ...]]]
 ) -> list[_RecordedContact]:
-    """Return the contacts to record: those of the first peers of each group."""
+    """Return the contacts to record: those of the first peers of each class."""
     comm_graph = build_comm_graph(model, resolve(model).timings)
-    peers_per_group = max(1, MOST_PEERS // len(groups))
+    peers_per_class = max(1, MOST_PEERS // len(with_contacts))
     result = []
-    for peer_class, forces in groups:
-        for peer in itertools.islice(peer_class.peers, peers_per_group):
+    for peer_class, forces in with_contacts:
+        for peer in itertools.islice(peer_class.peers, peers_per_class):
             name = comm_graph.peer_name(peer)
             for push in forces:
                 states = peer_class.jacobians.peer_type.states

@@ -1,7 +1,7 @@
 """Lur'e form: a model with its contacts cut open, from contact forces to the displacements that they follow.
 
 Takes: a `NumericModel` whose peers have switching parts.
-Gives: `contact_groups`, `with_gain`; `CutPeers`, `LurePlant`, `lure_plants`; `negated`.
+Gives: `contact_classes`, `with_gain`; `CutPeers`, `LurePlant`, `lure_plants`; `negated`.
 Guarantees: every matrix has radii; a drift with all contacts open is removed, exactly. The cost grows with
 the number of different peers, not of all.
 Does not: decide stability (see `arbitrary_switching`).
@@ -97,7 +97,7 @@ class LurePlant:
     jumps: str
 
 
-def contact_groups(numeric: NumericModel) -> list[tuple[PeerClass, tuple[SectorNonlinearity, ...]]]:
+def contact_classes(numeric: NumericModel) -> list[tuple[PeerClass, tuple[SectorNonlinearity, ...]]]:
     """Return the classes of equal peers with all contacts on, and the contact forces of each class.
 
     Parameters
@@ -156,7 +156,7 @@ def with_gain(peer_class: PeerClass, forces: Sequence[SectorNonlinearity], gain:
     Parameters
     ----------
     peer_class, forces
-        As for `contact_groups`.
+        As for `contact_classes`.
     gain
         The factor.
     """
@@ -188,7 +188,7 @@ def lure_plants(numeric: NumericModel) -> list[LurePlant]:
     Raises NotSupportedError with the reason if the form does not exist.
     """
     cut_classes: list[CutPeers] = []
-    for peer_class, forces in contact_groups(numeric):
+    for peer_class, forces in contact_classes(numeric):
         for force in forces:
             if force.sector and not force.shares:
                 raise NotSupportedError(force.sector)
@@ -197,11 +197,11 @@ def lure_plants(numeric: NumericModel) -> list[LurePlant]:
     loops = orthogonal_loops([item.peer_class for item in cut_classes], numeric.comm_graph, LURE_STATES)
     result = []
     for modal_system in loops:
-        cut_groups = [cut_of_class[peer_class.index] for peer_class in modal_system.peer_classes]
-        size = modal_system.states + sum(len(cut_classes.ticks) for cut_classes in cut_groups)
+        cut_of_system = [cut_of_class[peer_class.index] for peer_class in modal_system.peer_classes]
+        size = modal_system.states + sum(len(cut.ticks) for cut in cut_of_system)
         if size > LURE_STATES:
             raise NotSupportedError(f"{size:,} coupled states and contact ticks; the limit is {LURE_STATES}")
-        result.append(_lure_plant(modal_system, cut_groups))
+        result.append(_lure_plant(modal_system, cut_of_system))
     return result
 
 
