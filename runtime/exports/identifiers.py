@@ -50,9 +50,9 @@ def prefixed(prefix: str, names: Iterable[str]) -> tuple[str, ...]:
     )
 
 
-def unique(names: Iterable[str], occupied: Iterable[str] = ()) -> tuple[str, ...]:
-    """Return distinct names that are not occupied: a number is appended to a repeated name."""
-    used, texts, counts = set(occupied), list[str](), dict[str, int]()
+def unique(names: Iterable[str]) -> tuple[str, ...]:
+    """Return distinct names: a number is appended to a repeated name."""
+    used, texts, counts = set[str](), list[str](), dict[str, int]()
     for base in names:
         name, count = base, counts.get(base, 1)
         while name in used:

@@ -243,7 +243,7 @@ def lifted(
     numbers
         The numerical parts of the frame.
     """
-    with single_threaded(), finite_equations(model.name), np.errstate(all="ignore"):
+    with single_threaded(), finite_equations(model.origin.topology), np.errstate(all="ignore"):
         link = _link_of(model, open_at)
         driven_peers = [
             _open_loop(model, peer_class, "" if link else open_at, numbers) for peer_class in peer_classes

@@ -39,8 +39,10 @@ _STEPS = {casadi.OP_FLOOR, casadi.OP_CEIL}
 DECIDING = _BINARY | _UNARY
 
 
-def guards_of(expression: Any, moving: Any, *, tables: bool = True) -> list[Any]:
+def guards_of(expression: Any, moving: Any) -> list[Any]:
     """Return the guards of an expression: functions that change sign where it is not smooth.
+
+    The breakpoints of tables are included.
 
     Parameters
     ----------
@@ -48,8 +50,6 @@ def guards_of(expression: Any, moving: Any, *, tables: bool = True) -> list[Any]
         A column, `casadi.SX`.
     moving
         The symbols that vary; guards without any of them are left out.
-    tables
-        Whether the breakpoints of tables are included.
     """
     result = []
     for node in nodes_of(expression):
@@ -62,11 +62,10 @@ def guards_of(expression: Any, moving: Any, *, tables: bool = True) -> list[Any]
         elif code in _STEPS:
             # Changes sign at each integer and half-way between, where the split has no effect.
             result.append(_integer_indicator(parts[0]))
-    if tables:
-        result += [
-            _integer_indicator(function_of(table.positions())(argument))
-            for table, argument in lookups_of(expression)
-        ]
+    result += [
+        _integer_indicator(function_of(table.positions())(argument))
+        for table, argument in lookups_of(expression)
+    ]
     return [item for item in result if casadi.depends_on(item, moving)]
 
 

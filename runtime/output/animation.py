@@ -31,7 +31,6 @@ if TYPE_CHECKING:
 SUFFIXES = (".gif", ".mp4")
 RATE = 20  # frames a second
 SHORTEST, LONGEST = 4.0, 12.0  # seconds that it can be watched for
-ROOM = 0.08  # of what is drawn, around it
 DPI = 90
 
 

@@ -71,9 +71,9 @@ def new_figure(size: tuple[float, float]) -> Any:
     return need("matplotlib.figure", "plot").Figure(figsize=size, layout="constrained")
 
 
-def legend_below(ax: Any, index: float = -0.14, fontsize: float = 8, ncols: int = 2) -> None:
+def legend_below(ax: Any, index: float = -0.14, ncols: int = 2) -> None:
     """Put the legend below an Axes, over nothing; `index` is in heights of the Axes, from its lower edge."""
-    style = {"ncols": ncols, "fontsize": fontsize, "frameon": False}
+    style = {"ncols": ncols, "fontsize": 8, "frameon": False}
     handles, labels = short_legend(*ax.get_legend_handles_labels())
     ax.legend(handles, labels, loc="upper center", bbox_to_anchor=(0.5, index), **style)
 

@@ -12,7 +12,6 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from apc.compiler.wording import counted, known_digits
 from apc.output.analysis_output import range_document
@@ -37,7 +36,6 @@ if TYPE_CHECKING:
     from apc.regions.panels import Panel, Panels
     from apc.regions.stable_region import Curve, Region
 
-Floats = NDArray[np.float64]
 
 # Curves listed; of a boundary with more curves only the number is printed.
 MOST_CURVES = 12

@@ -212,7 +212,7 @@ class SummaryAccumulator:
         low, high, ends = self.low[:group_count], self.high[:group_count], self.ends[:group_count]
         with np.errstate(over="ignore", invalid="ignore"):  # of a diverged motion
             settled = self._settled(low, high, ends)
-            fit = self._fit(high.max(axis=0) - low.min(axis=0), float(ends[-1]))
+            fit = self._fit(high.max(axis=0) - low.min(axis=0))
         signals = self.signals
         end_values = np.stack([self.first, self.last, low.min(axis=0), high.max(axis=0)], axis=1).tolist()
         extents = tuple(
@@ -308,7 +308,7 @@ class SummaryAccumulator:
         settling_times = np.append(0.0, ends)[first_settled_group]
         return np.where(settling_times <= LATE * ends[-1], settling_times, np.nan)
 
-    def _fit(self, span: Floats, end: float) -> Fit | None:
+    def _fit(self, span: Floats) -> Fit | None:
         """Return the fit of the stored rows after `until`, None without rows or positions."""
         stored = np.arange(max(self.rows - len(self.samples), 0), self.rows) % len(self.samples)
         stored = stored[self.instants[stored] >= max(self.until, self.changed)]

@@ -134,10 +134,6 @@ class ScenarioOptimizer:
         """Return the gains (…, m) at shares of their ranges."""
         return np.asarray(self._low + self._width * np.clip(shares, *self._ends))
 
-    def _worst_case(self, shares: Floats) -> Floats:
-        """Return the largest constraint at shares (k, m)."""
-        return np.asarray(self.constraints.worst_case(self.scenarios, self.gains(shares)).max(axis=1))
-
     def _merit(self, shares: Floats, worst: Floats) -> Floats:
         """Return the objective (k,) to be minimized, at points that satisfy the constraints."""
         return worst if self.column is None else -self.sign * shares[:, self.column]

@@ -39,15 +39,13 @@ STRIDE = 8
 QUANTILE = 0.975
 
 
-def top_lyapunov_exponent(numeric: NumericModel, *, seed: int = 0) -> TopLyapunovExponent:
+def top_lyapunov_exponent(numeric: NumericModel) -> TopLyapunovExponent:
     """Return a Monte Carlo estimate of the top Lyapunov exponent of a model, per frame.
 
     Parameters
     ----------
     numeric
         The model with its parameter values.
-    seed
-        The seed of the random losses.
     """
     model = numeric.model
     reception = build_reception(numeric)
@@ -65,7 +63,7 @@ def top_lyapunov_exponent(numeric: NumericModel, *, seed: int = 0) -> TopLyapuno
     # The frame matrix with all packets received, and the correction terms for losses.
     received = frame.mean - (share * (frame.input @ frame.reception_errors)).sum(axis=0)
     stacked = np.concatenate([received, frame.reception_errors.reshape(count * width, n)])
-    rng = np.random.Generator(np.random.Philox(seed))
+    rng = np.random.Generator(np.random.Philox(0))
     x, total = rng.standard_normal((n, REALIZATIONS)), np.zeros(REALIZATIONS)
     for number, lost in enumerate(_sample_losses(frame.laws, REALIZATIONS, SETTLING + FRAMES, rng)):
         product = stacked @ x
