@@ -1,69 +1,67 @@
 """Find for each threshold of the product a test that fails where the threshold is another.
 
-    python -m tests.mutants.thresholds --reach FILE [--seconds 10] [--within runtime/lifting]
+    python -m tests.mutants.thresholds --reach FILE [--seconds 8] [--within runtime/lifting]
 
-Each constant of the page "Thresholds" is multiplied and divided by ten in a copy of this checkout, and the
-tests that ran a line which uses it are run, the quickest first. The first that fails is written to
+Each constant of the page "Thresholds" is multiplied and divided by ten in a process of its own, and the tests
+that ran a line which uses it are run there, the quickest first. The first that fails is written to
 `thresholds.json` beside this file, "" where all pass. Constants that stand in the file are not tried again.
+FILE is that of `python -m tests.mutants --reach FILE`.
 """
 
 from __future__ import annotations
 
 import argparse
 import ast
+import contextlib
 import importlib
 import json
-import queue
-import re
+import os
+import signal
 import sys
-import tempfile
-from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from tests.mutants.copies import ROOT, product_copy, run_tests
+import pytest
+from _pytest.runner import runtestprotocol
+
+from tests.mutants.copies import ROOT
 
 FOUND = Path(__file__).with_name("thresholds.json")
-FACTOR = 10
-MOST_TESTS = 60
+FACTOR, MOST_TESTS, LIMIT_S = 10, 150, 40
 
 
-def main() -> None:
+def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.mutants.thresholds", description=__doc__)
-    parser.add_argument("--reach", type=Path, required=True, help="file of who runs what: read, or written")
-    parser.add_argument("--seconds", type=float, default=10.0, help="of unchanged tests a constant")
+    parser.add_argument("--reach", type=Path, required=True, help="file of which test runs which line")
+    parser.add_argument("--seconds", type=float, default=8.0, help="of tests for each constant")
     parser.add_argument("--within", default="", help="only files whose path begins so")
-    parser.add_argument("--jobs", type=int, default=1)
     requested = parser.parse_args()
-    found = json.loads(FOUND.read_text(encoding="utf-8")) if FOUND.is_file() else {}
-    wanted = {
-        key: (path, names) for key, path, names in thresholds() if str(path).startswith(requested.within)
-    }
-    with tempfile.TemporaryDirectory() as folder:
-        copies: queue.Queue[Path] = queue.Queue()
-        for place in range(requested.jobs):
-            copies.put(product_copy(Path(folder) / str(place)))
-        if not requested.reach.exists():
-            copy = copies.get()
-            run_tests(copy, ["watched", str(copy), str(requested.reach.resolve())], limit=None)
-            copies.put(copy)
-        known = json.loads(requested.reach.read_text(encoding="utf-8"))
+    known = json.loads(requested.reach.read_text(encoding="utf-8"))
+    plugin = Thresholds(known, requested.seconds, requested.within)
+    return int(pytest.main(["-n", "0", "-q", "-s", "-p", "no:cacheprovider"], plugins=[plugin]))
 
-        def tried(key: str) -> str:
-            path, names = wanted[key]
-            copy = copies.get()
-            try:
-                return failing(copy, path, names, reaching(known, path, names, requested.seconds))
-            finally:
-                copies.put(copy)
 
-        keys = [key for key in wanted if key not in found]
-        with ThreadPoolExecutor(requested.jobs) as pool:
-            for key, test in zip(keys, pool.map(tried, keys), strict=True):
-                print(f"{key}: {test or 'none'}", flush=True)
-                found[key] = test
-                FOUND.write_text(json.dumps(found, indent=1, sort_keys=True) + "\n", encoding="utf-8")
+class Thresholds:
+    """A plugin that tries each constant with the tests that use it, in place of a run of all tests."""
+
+    def __init__(self, known: dict[str, Any], seconds: float, within: str) -> None:
+        self.known, self.seconds, self.within = known, seconds, within
+
+    @pytest.hookimpl(tryfirst=True)
+    def pytest_runtestloop(self, session: pytest.Session) -> bool:
+        items = {item.nodeid: item for item in session.items}
+        found = json.loads(FOUND.read_text(encoding="utf-8")) if FOUND.is_file() else {}
+        for key, path, names in thresholds():
+            if key in found or not str(path).startswith(self.within):
+                continue
+            used = uses(path, names)
+            tests = [items[name] for name in reaching(self.known, used, self.seconds) if name in items]
+            failed = fixing(tests, used, path, names)
+            found[key] = failed.partition("[")[0]
+            print(f"{key}: {found[key] or 'none'} ({len(tests)} tests)", flush=True)
+            FOUND.write_text(json.dumps(found, indent=1, sort_keys=True) + "\n", encoding="utf-8")
+        return True
 
 
 def thresholds() -> Iterator[tuple[str, Path, str]]:
@@ -77,42 +75,15 @@ def thresholds() -> Iterator[tuple[str, Path, str]]:
                     yield generate.threshold_key(path, names), path.relative_to(ROOT), names
 
 
-def changed(text: str, names: str, factor: float) -> str:
-    """Return a module's text with the numbers of a constant multiplied."""
-    for node in ast.parse(text).body:
-        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]).strip("()") == names:
-            break
-    else:
-        raise KeyError(names)
-    scaled = _multiplied(node.value, factor)
-    lines = text.splitlines(keepends=True)
-    return "".join(
-        [
-            *lines[: node.lineno - 1],
-            f"{names} = {ast.unparse(scaled)}\n",
-            *lines[node.end_lineno or node.lineno :],
-        ]
-    )
-
-
-def _multiplied(node: ast.expr, factor: float) -> ast.expr:
-    """Return a number, or a tuple of numbers, multiplied; a whole number stays whole, and 0 is the factor."""
-    if isinstance(node, ast.Tuple):
-        return ast.Tuple([_multiplied(item, factor) for item in node.elts], ast.Load())
-    number = eval(ast.unparse(node))  # numbers alone: see `constants` of docs/generate.py
-    product = number * factor if number else factor
-    if isinstance(number, int):
-        product = max(round(product), 1) if number >= 0 else min(round(product), -1)
-    return ast.parse(repr(product), mode="eval").body
-
-
 def uses(path: Path, names: str) -> dict[str, set[int]]:
     """Return the lines that use a constant, by file: in its own module, and in those that import it."""
     wanted, module = set(names.split(", ")), path.stem
     lines: dict[str, set[int]] = {}
     for file in sorted((ROOT / "runtime").rglob("*.py")):
-        tree = ast.parse(file.read_text(encoding="utf-8"))
-        relative = file.relative_to(ROOT)
+        text = file.read_text(encoding="utf-8")
+        if not any(name in text for name in wanted):
+            continue
+        tree, relative = ast.parse(text), file.relative_to(ROOT)
         here = wanted if relative == path else set()
         for node in ast.walk(tree):
             if isinstance(node, ast.ImportFrom) and (node.module or "").rpartition(".")[2] == module:
@@ -127,11 +98,11 @@ def uses(path: Path, names: str) -> dict[str, set[int]]:
     return lines
 
 
-def reaching(known: dict[str, Any], path: Path, names: str, seconds: float) -> list[str]:
-    """Return the tests that ran a line which uses a constant, the quickest first, up to a total duration."""
+def reaching(known: dict[str, Any], used: dict[str, set[int]], seconds: float) -> list[str]:
+    """Return the tests that ran one of these lines, the quickest first, up to a total duration."""
     places = {
         place
-        for file, lines in uses(path, names).items()
+        for file, lines in used.items()
         for line in lines
         for place in known["lines"].get(file, {}).get(str(line), ())
     }
@@ -144,24 +115,61 @@ def reaching(known: dict[str, Any], path: Path, names: str, seconds: float) -> l
     return tests
 
 
-def failing(copy: Path, path: Path, names: str, tests: list[str]) -> str:
-    """Return the first test that fails with a constant multiplied or divided, "" if none does."""
-    if not tests:
-        return ""
-    file = copy / path
-    text = file.read_text(encoding="utf-8")
-    (copy / "names.json").write_text(json.dumps(tests), encoding="utf-8")
-    try:
-        for factor in (FACTOR, 1 / FACTOR):
-            file.write_text(changed(text, names, factor), encoding="utf-8")
-            if run_tests(copy, ["chosen", str(copy / "names.json")], limit=180) != 0:
-                log = (copy / "log.txt").read_text(encoding="utf-8")
-                if match := re.search(r"^(?:FAILED|ERROR) (\S+?)(?:\[| - |$)", log, re.MULTILINE):
-                    return match.group(1)
-    finally:
-        file.write_text(text, encoding="utf-8")
+def fixing(tests: Sequence[pytest.Item], used: dict[str, set[int]], path: Path, names: str) -> str:
+    """Return the first test that fails with a constant multiplied or divided, and passes without, or ""."""
+    for factor in (FACTOR, 1 / FACTOR):
+        failed = failing(tests, used, path, names, factor)
+        alone = [item for item in tests if item.nodeid == failed]
+        if failed and not failing(alone, used, path, names, 1):
+            return failed
     return ""
 
 
+def failing(
+    tests: Sequence[pytest.Item], used: dict[str, set[int]], path: Path, names: str, factor: float
+) -> str:
+    """Return the first test that fails with a constant multiplied by a factor, "" if none does in time."""
+    if not tests:
+        return ""
+    reader, writer = os.pipe()
+    process = os.fork()
+    if not process:
+        with contextlib.suppress(BaseException):
+            signal.alarm(LIMIT_S)
+            silent = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(silent, 1)
+            os.dup2(silent, 2)
+            change([*used, str(path)], names, factor)
+            for item in tests:
+                if any(report.failed for report in runtestprotocol(item, log=False, nextitem=None)):
+                    os.write(writer, item.nodeid.encode())
+                    break
+        os._exit(0)
+    os.close(writer)
+    with os.fdopen(reader, "rb") as answer:
+        failed = answer.read().decode()
+    os.waitpid(process, 0)
+    return failed
+
+
+def change(files: Sequence[str], names: str, factor: float) -> None:
+    """Multiply a constant by a factor in the modules that have it."""
+    for file in files:
+        module = importlib.import_module(".".join(("apc", *Path(file).with_suffix("").parts[1:])))
+        for name in names.split(", "):
+            if hasattr(module, name):
+                setattr(module, name, multiplied(getattr(module, name), factor))
+
+
+def multiplied(value: Any, factor: float) -> Any:
+    """Return a number or a tuple of numbers multiplied; whole numbers stay whole, and 0 is the factor."""
+    if isinstance(value, tuple):
+        return tuple(multiplied(item, factor) for item in value)
+    product = value * factor if value else factor
+    if isinstance(value, int):
+        product = max(round(product), 1) if value >= 0 else min(round(product), -1)
+    return product
+
+
 if __name__ == "__main__":
-    main()
+    sys.exit(main())
