@@ -299,7 +299,7 @@ class EquilibriumEquations:
     def unbalanced(self, z: Floats) -> str:
         """Return the largest unbalanced force at a point, and its part, in words."""
         size, unit, _, name = self.largest_force(z)
-        return f"{with_unit(f'{size:.4g}', unit)} acts on {name}"
+        return f"{with_unit(f'{size:.4g}', unit)} remains unbalanced at {name}"
 
     def active(self, z: Floats) -> tuple[tuple[str, bool], ...]:
         """Return whether each contact or limit is on its steepest branch, by name.
@@ -345,7 +345,7 @@ def root_of(equations: EquilibriumEquations) -> Floats:
             Diagnostic("E849", location, message, advice=f"replace it by a constant force, or {at_start}")
         )
     z, forces = _with_weak_springs(equations)
-    with_springs = z
+    with_springs, sides = z, equations.active(z)
     for _ in range(MOST_STEPS):
         sides, z = equations.active(z), z + equations.step(z)
         if not np.isfinite(z).all():
@@ -357,11 +357,15 @@ def root_of(equations: EquilibriumEquations) -> Floats:
                 raise ApcError(Diagnostic("E849", location, message, advice=at_start))
             return z
     if forces[-1] > FREE * max(forces[-2:]) > 0:  # springs carry it, however weak
-        message = f"no equilibrium: {equations.unbalanced(with_springs)}, and nothing balances it"
+        message = f"no equilibrium: {equations.unbalanced(with_springs)}"
         advice = f"hold the part by a spring, a contact or a hand, remove the force, or {at_start}"
         raise ApcError(Diagnostic("E847", location, message, advice=advice))
-    finite = np.isfinite(z).all() and np.isfinite(equations.evaluated(z)[0]).all()
-    subject = equations.unbalanced(z) if finite else "an equation has no finite value or slope"
+    subject = "an equation has no finite value or slope"
+    if np.isfinite(z).all() and np.isfinite(equations.evaluated(z)[0]).all():
+        undecided = ", ".join(sorted({name for name, _ in {*sides} ^ {*equations.active(z)}}))
+        subject = equations.unbalanced(z)
+        if equations.balanced(z) and undecided:
+            subject = f"rounding decides the branch of {undecided}"
     message = f"no equilibrium found: {subject} at the last step"
     advice = (
         'set start values near the equilibrium, take those of apc.operating_point(initial="simulation"), or '

@@ -130,6 +130,8 @@ def option_values(
             mistakes += error.mistakes
             corrected.append(error.mistakes[0].fix)
     if mistakes:
+        if between == ":" and len(set(corrected)) < len(corrected):  # a range with two equal ends is refused
+            corrected[-1] = corrected[-1].replace("1", "2", 1)
         fix = f"{label}={between.join(corrected)}{rest}" if all(corrected) else ""
         raise ApcError(replace(mistakes[0], fix=fix))
     return tuple(values)

@@ -328,7 +328,7 @@ def test_a_direction_without_stiffness_keeps_its_start() -> None:
 def test_an_equilibrium_that_does_not_exist_is_refused() -> None:
     free = WALL.format(force=-2).replace("stiffness: 100 N/m", "stiffness: 0 N/m")
     (message,) = messages_of(apc.operating_point, compiled(free.replace("150 N/m", "0 N/m")))
-    assert "E847 no equilibrium: 2 N acts on device, and nothing balances it." in message
+    assert "E847 no equilibrium: 2 N remains unbalanced at device." in message
     moving = (
         WALL.format(force=1)
         .replace("ConstantForce", "SineForce")

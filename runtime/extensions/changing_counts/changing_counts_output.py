@@ -23,7 +23,8 @@ NEAR_START = "nonlinear topology: the result holds near the initial state"
 def changing_counts_text(result: ChangingCounts) -> Lines:
     """Yield the verdict, the time between changes, the growing sequence, and the families of motions."""
     alone = len(result.sequence) == 1
-    verdict = f"unstable with {result.parameter} = {result.sequence[0]}" if alone else result.verdict
+    example = f"unstable without changes, for example with {result.parameter} = "
+    verdict = f"{example}{result.sequence[0]}" if alone else result.verdict
     yield f"{result.topology}: {verdict}{'' if alone else ' of the number of peers'}"
     notes = [NEAR_START] * result.linearized + [LEFT_OUT] * result.lossy
     if result.assumed:

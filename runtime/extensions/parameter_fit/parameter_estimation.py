@@ -37,6 +37,7 @@ from apc.realtime.run_folder import read_run
 from apc.result import PlotStyle, Result
 from apc.simulation.interpreted_engine import InterpretedEngine
 from apc.simulation.output_blocks import blocks, instants_of
+from apc.simulation.presence import refuse_joins_and_leaves
 from apc.simulation.settings import DEFAULT, Method, Settings
 from apc.simulation.simulation import check_length, prepare
 from apc.studies.parameter_ranges import parse_range
@@ -208,6 +209,7 @@ def fit(
         E711 to E713 the recording or the model is unsuitable, E715 the recording does not determine a
         parameter, E716 the search fails; and those of `simulate`.
     """
+    refuse_joins_and_leaves(model, "apc fit")
     if recording.is_dir():
         recorded = signals_of_run(model, read_run(recording), signals)
     else:

@@ -28,7 +28,6 @@ from apc.parameter_values.parameters import resolve
 from apc.realtime.peer import live_topology
 from apc.realtime.peer_run import RealtimeRun
 from apc.realtime.run_comparison import reason_not_simulated
-from apc.simulation.presence import refuse_joins_and_leaves
 from apc.simulation.settings import Settings
 from apc.simulation.signals import Signal
 from apc.simulation.simulation import prepare
@@ -96,7 +95,6 @@ def recorded_signals(model: Model, table: MeasuredTable, patterns: Sequence[str]
     ApcError
         E711 a column is unknown, ambiguous or has another unit; no column is measured.
     """
-    refuse_joins_and_leaves(model, "apc fit")
     if not model.clocks:  # rows at the instants of the recording
         names = f"{CLOCK} period", f"{CLOCK} phase"
         times = Timing(names[0], table.interval), Timing(names[1], Fraction(0))
