@@ -8,8 +8,8 @@ Does not: give a verdict for periods whose frame with the other clocks is longer
 
 A period changes the frame, the least common multiple of all periods. If all clocks scale with the number, for
 example a single clock, every value has the same number of ticks in a frame: the axis is continuous. With a
-clock of another period only commensurate values are analysed: at p/q times the common divisor of the other
-periods, a frame has about p + q ticks. The verdict at a period in a simple ratio to the others may differ
+clock of another period only commensurate values are analysed: at p/q times the common multiple F of the other
+periods, a frame is p F long. The verdict at a period in a simple ratio to the others may differ
 from that of all periods near it: near each value the simplest ratio and one of a long frame are analyzed.
 Between two periods of different verdicts, a period of the middle third follows, as long as its frame is
 short. The remaining gap is the error of the critical value.
@@ -99,7 +99,8 @@ class _AnyPeriodPath(AnalyzedPath):
             yield SmoothSegment(low, high, points, float(low), sample_at, self.verdict_at, slow=True)
             return
         targets = sorted({low, *map(Fraction, points[1:-1].tolist()), high})
-        for period in periods_near(self.model, self.free, targets, self.location):
+        included = [now] if low < now < high else []
+        for period in periods_near(self.model, self.free, targets, self.location, included=included):
             yield SmoothSegment(
                 period,
                 period,

@@ -294,7 +294,7 @@ def _ranges_of_long_frames(
     for begin, end in ((low, first), (last, high)):
         if begin is not None and end is not None and float(begin) < float(end):
             span = " to ".join(with_unit(f"{float(value):g}", unit) for value in (begin, end))
-            yield f"{span} not searched: more than {MOST_FRAME_TICKS} ticks in a frame with the other clocks"
+            yield f"{span} not searched: no value tried there has a frame of at most {MOST_FRAME_TICKS} ticks"
 
 
 def _search_by_criterion(

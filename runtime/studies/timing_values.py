@@ -132,15 +132,21 @@ def _simplest_fraction(low: Fraction, high: Fraction) -> Fraction:
 def base_value(model: Model, parameter_ref: ParameterRef) -> Fraction:
     """Return the value in SI whose multiples by simple fractions lead to short frames.
 
-    It is the common divisor of the constant periods for a time, its inverse for a rate, 1 for another number,
-    and the present value if there is no constant period.
+    It is the common multiple F of the constant periods for a time, its inverse for a rate, 1 for another
+    number, and the present value if there is no constant period. With a period a/b F in lowest terms a frame
+    is a F long.
     """
+    return _base_values(model, parameter_ref)[0]
+
+
+def _base_values(model: Model, parameter_ref: ParameterRef) -> tuple[Fraction, ...]:
+    """Return the value of `base_value`, and the same of the common divisor of the constant periods."""
     slopes, timings = timing_slopes(model, parameter_ref), resolve(model).timings
     fixed = [timings[name] for name in _clock_times(model, phases=False) if not slopes[name]]
     if not fixed:
-        return delay_now(model, parameter_ref)
-    unit, divisor = unit_of(model, parameter_ref.name), common_divisor(fixed)
-    return divisor if unit == "s" else 1 / divisor if unit in RATES else Fraction(1)
+        return (delay_now(model, parameter_ref),)
+    unit, times = unit_of(model, parameter_ref.name), (common_multiple(fixed), common_divisor(fixed))
+    return times if unit == "s" else tuple(1 / time for time in times) if unit in RATES else (Fraction(1),)
 
 
 def period_between(
@@ -208,14 +214,19 @@ def nearest_period(model: Model, parameter_ref: ParameterRef, value: Fraction) -
 
 
 def periods_near(
-    model: Model, parameter_ref: ParameterRef, targets: Sequence[Fraction], location: SourceLocation
+    model: Model,
+    parameter_ref: ParameterRef,
+    targets: Sequence[Fraction],
+    location: SourceLocation,
+    *,
+    included: Sequence[Fraction] = (),
 ) -> list[Fraction]:
     """Return values of a period or rate near some values, ascending, each with a frame of allowed length.
 
-    They are, near each value between the first and the last, the one in the simplest ratio to the constant
-    periods, and on either side of it one in a ratio so complex that its frame has nearly
-    `MOST_FRAME_TICKS` ticks (see `long_period_between`). The first and the last value are included
-    unchanged if their frames are short.
+    They are, near each value between the first and the last, those in the simplest ratio to the common
+    multiple and divisor of the constant periods, and on either side of each one in a ratio so complex that
+    its frame has nearly `MOST_FRAME_TICKS` ticks (see `long_period_between`). The first and the last value,
+    and those of `included`, are included unchanged if their frames are short.
 
     Parameters
     ----------
@@ -225,31 +236,34 @@ def periods_near(
         The values in ascending order, in SI.
     location
         The location of the number, for messages.
+    included
+        Further values in SI.
 
     Raises
     ------
     ApcError
         E844 fewer than two periods have a frame of at most `MOST_FRAME_TICKS` ticks.
     """
-    unit = base_value(model, parameter_ref)
+    unit, *others = _base_values(model, parameter_ref)
     periods = {
         value
-        for value in (targets[0], targets[-1])
+        for value in (targets[0], *included, targets[-1])
         if _frame_ticks(model, parameter_ref, value) <= MOST_FRAME_TICKS
     }
     for before, value, after in zip(targets, targets[1:], targets[2:], strict=False):
         low, high = value - (value - before) / 3, value + (after - value) / 3
-        near = period_between(model, parameter_ref, unit, low, high)
-        if near is None:
-            continue
-        periods.add(near)
-        for end in (low, high):  # on both sides of it, as near as possible
-            for share in SHARES:
-                ends = sorted((near, near + (end - near) * share))
-                long_period = long_period_between(model, parameter_ref, unit, *ends)
-                if long_period is not None:
-                    periods.add(long_period)
-                    break
+        simplest = {period_between(model, parameter_ref, base, low, high) for base in (unit, *others)} - {
+            None
+        }
+        for near in filter(None, simplest):
+            periods.add(near)
+            for end in (low, high):  # on both sides of it, as near as possible
+                for share in SHARES:
+                    ends = sorted((near, near + (end - near) * share))
+                    long_period = long_period_between(model, parameter_ref, unit, *ends)
+                    if long_period is not None:
+                        periods.add(long_period)
+                        break
     if len(periods) < 2:
         si_unit = str(unit_of(model, parameter_ref.name))
         span = " to ".join(with_unit(f"{float(end):g}", si_unit) for end in (targets[0], targets[-1]))
@@ -257,6 +271,6 @@ def periods_near(
             f"values of {parameter_ref.label} from {span} lead to frames of more than "
             f"{MOST_FRAME_TICKS:,} ticks with the other clocks"
         )
-        advice = f"use a range around a multiple of {with_unit(f'{float(unit):g}', si_unit)}"
+        advice = f"use a range around a simple fraction of {with_unit(f'{float(unit):g}', si_unit)}"
         raise ApcError(Diagnostic("E844", location, message, advice=advice))
     return sorted(periods)
