@@ -218,6 +218,12 @@ def open_table(
     except ApcError:
         if not any(map(str.strip, first)) or _is_table(first, known):
             raise
+        separator = next((mark for mark in ";\t" if len(first) == 1 and mark in first[0]), "")
+        if separator:
+            got = {";": "semicolons", "\t": "tabs"}[separator]
+            raise fault(
+                "E702", SourceLocation(name, 1, 1), "separator", "commas", got, advice="save it with commas"
+            ) from None
         expected = "a name and its unit in each heading"
         raise fault("E702", SourceLocation(name, 1, 1), "table", expected, fix=example) from None
 

@@ -489,7 +489,9 @@ def _refuse_unsupported(model: Model, comm_graph: CommunicationGraph) -> None:
             raise _refused(model, message, "use order: before, or apc simulate")
         if len(link.clocks) > 1:
             message = f"different clocks of the pairs of groups of {link.name}"
-            raise _refused(model, message, "use one link for each clock, or apc simulate")
+            raise _refused(
+                model, message, "use one link for each clock, whose means are then separate, or apc simulate"
+            )
     for peer_type in model.peer_types:
         for function, _, message, _ in [
             (peer_type.derivative, "", "what moves", ""),

@@ -322,7 +322,11 @@ def _refuse_iterations(model: Model, name: str, peer_type: PeerType) -> None:
         raise refused(model, f"{message}, which is not exported to C", advice=advice)
     if several := [link.name for link in model.links if len(link.clocks) > 1]:
         message = f"pairs of groups of {several[0]} have different clocks, which is not exported to C"
-        raise refused(model, message, advice="use one link for each clock, or apc simulate")
+        raise refused(
+            model,
+            message,
+            advice="use one link for each clock, whose means are then separate, or apc simulate",
+        )
     for function, when, message, where in instant_functions(peer_type):
         if not function.is_a("SXFunction"):
             message = f"{name}: {when}{message}{where} need an iteration, which is not exported to C"

@@ -14,6 +14,7 @@ import re
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
 from fractions import Fraction
+from itertools import islice, repeat
 
 from apc.compiler.compiled import (
     COUNT,
@@ -168,6 +169,10 @@ def find(
             raise ApcError(Diagnostic("E622", location, f"{written} is not in the topology", fix=fix))
     if name not in known:
         period = f"{name}.period"  # of a clock
+        if rest in ("rate", "frequency"):
+            period = f"{first}.period"
+        if rest.startswith("delays."):
+            period = f"{first}.pairs.{rest.partition('.')[2]}.delay"
         near = period if period in known else nearest(name, sorted(known))
         raise ApcError(
             Diagnostic("E622", location, f"{written} is not a parameter of {model.name}", fix=near)
@@ -221,8 +226,9 @@ def _single_peer_error(
     )
     parameter = next(parameter for parameter in model.parameters if parameter.name == rest)
     local = next((value for value in group.values if value.name == rest), parameter)
-    value = with_unit(f"{local.value:.12g}", local.unit)
-    values = [new_value if k == int(match["peer"]) else value for k in range(1, group.count + 1)]
+    present = next((column.values for column in group.columns if column.name == rest), repeat(local.value))
+    values = [with_unit(f"{value:.12g}", local.unit) for value in islice(present, group.count)]
+    values[int(match["peer"]) - 1 : int(match["peer"])] = [new_value] * (int(match["peer"]) <= group.count)
     fix = f"peers: {{{group.name}: {{count: {group.count}, set: {{{rest}: [{', '.join(values)}]}}}}}}"
     advice = ""
     if group.count > MOST_LISTED:

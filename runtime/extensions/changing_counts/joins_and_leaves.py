@@ -212,6 +212,9 @@ def _counts(numeric: NumericModel, name: str, values: str) -> tuple[ParameterRef
         for count in axis.values:
             apply(model, [Override(axis.free, count)])
     except ApcError as error:
+        if error.mistakes[0].code == "E883":  # more values than any study has
+            expected = f"at most {MOST_COUNTS} counts"
+            raise ApcError(Diagnostic("E890", LOCATION, name, expected, values[:80], fix)) from None
         raise _located(error, names, values, fix) from None
     return axis.free, tuple(sorted(map(int, axis.values)))
 

@@ -144,7 +144,9 @@ def _check_links(model: Model, presence: Presence, mistakes: Mistakes) -> None:
             if value not in allowed:
                 subject, got = f"{word} of {link.name} with joins or leaves", value.replace("arcs", "a list")
                 expected = " or ".join(allowed)
-                if value == "arcs":
+                if value == "star":
+                    how = {"advice": "keep the first peer, the center of the star, present"}
+                elif value == "arcs":
                     how = {"advice": f"joins and leaves need one of these graphs of {link.name}"}
                 else:
                     how = {"fix": f"{word}: {allowed[0]}"}
