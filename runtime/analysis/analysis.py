@@ -28,7 +28,7 @@ from apc.lifting.discretize import TOO_LARGE
 from apc.lifting.equilibrium_equations import depends_on_time
 from apc.lifting.numeric_model import NumericModel, linearized_at_start
 from apc.lifting.rest_position import OperatingPoint, equilibrium_moves, equilibrium_note
-from apc.linearization.evaluation_errors import finite_equations
+from apc.linearization.evaluation_errors import evaluating
 from apc.network.nominal_criterion import limitations, unreliable
 from apc.parameter_values.parameter_names import ParameterRef
 from apc.result import PlotStyle, Result
@@ -46,7 +46,6 @@ from apc.spectrum.peer_classes import (
 from apc.spectrum.rigid_modes import NeutralModes, classify_neutral_modes
 from apc.spectrum.spectrum import Mode, Spectrum, solve_spectrum, up_to
 from apc.support.state_limits import MATRIX_STATES
-from apc.support.threads import single_threaded
 from apc.timing.communication_graph import CommunicationGraph
 from apc.verdict import (
     NO_PROOF,
@@ -330,7 +329,7 @@ def _analyze(side: Side, *, method: str, certify: bool, exact_work: float) -> An
     model, nonlinear = numeric.model, not numeric.affine
     elements = replaced_elements(model)
     linearized = nonlinear or bool(elements)
-    with single_threaded(), finite_equations(model.origin.topology), np.errstate(all="ignore"):
+    with evaluating(model):
         plan, spectrum, notes = _spectrum(numeric, method, certify=certify, exact_work=exact_work)
         neutral_modes = _neutral_modes(spectrum, plan.loops, () if plan.loops else representatives(numeric))
     verdict, proof = _verdict(spectrum, neutral_modes), spectrum.proof

@@ -62,7 +62,7 @@ class ModelSize(Result):
 
 def model_size(model: Model) -> ModelSize:
     """Return the numbers of states, ticks and packets in a frame of a model."""
-    with finite_equations(model.origin.topology):
+    with finite_equations(model):
         return _model_size(model)
 
 

@@ -118,7 +118,7 @@ def sides(numeric: NumericModel) -> tuple[Side, ...]:
     model = numeric.model
     if numeric.starting or all(_has_no_kinks(numeric.jacobians[group.peer_type]) for group in model.groups):
         return (Side("", numeric),)
-    with finite_equations(model.origin.topology), np.errstate(all="ignore"):
+    with finite_equations(model), np.errstate(all="ignore"):
         may_have_kink = [_near_a_kink(numeric, index) for index in range(len(model.groups))]
         if not any(may_have_kink):
             return (Side("", numeric),)

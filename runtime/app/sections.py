@@ -167,7 +167,7 @@ def _roots(numeric: NumericModel, request: tuple[ParameterRef, tuple[Fraction, .
     free, values = request
     slow = kind_for_parameter(model, free) is not EvaluatorKind.MATRICES
     numbers = _thinned(values, FEW_ROOTS if slow else ROOTS)
-    with finite_equations(model.origin.topology):
+    with finite_equations(model):
         indices, rows = eigenvalues_at(numeric, free, numbers)
     result = np.concatenate([EMPTY, *rows])
     texts = [text_of(number, unit_of(model, free.name)) for number in numbers]

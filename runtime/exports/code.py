@@ -85,7 +85,7 @@ def _plan(model: Model, method: str) -> tuple[Method, SimulationPlan]:
     chosen_method = parse_method(method) if method else DEFAULT
     if not model.clocks:
         raise refused(model, f"{model.name} has no clock, so nothing is computed at ticks")
-    with finite_equations(model.origin.topology):
+    with finite_equations(model):
         return chosen_method, plan_of(model, chosen_method)
 
 

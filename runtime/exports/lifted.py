@@ -41,7 +41,7 @@ from apc.lifting.frame_inputs import OUTSIDE, with_cuts, with_holds, with_ports
 from apc.lifting.interval_arithmetic import FLOATS, MIDPOINT_RADIUS, Arithmetic, value_of
 from apc.lifting.lift import MOST_PACKETS, FrameMap, check_packets, compose, step_durations
 from apc.lifting.numeric_model import NumericModel, numeric_model
-from apc.linearization.evaluation_errors import finite_equations
+from apc.linearization.evaluation_errors import evaluating
 from apc.linearization.linear_subsystem import LinearSubsystem
 from apc.network.nominal_criterion import limitations
 from apc.result import Result
@@ -53,7 +53,6 @@ from apc.spectrum.modes import dense_loop
 from apc.spectrum.peer_classes import PeerClass, states_of
 from apc.support.distribution import versions
 from apc.support.memory import refuse_beyond
-from apc.support.threads import single_threaded
 from apc.timing.communication_graph import CommunicationGraph
 from apc.timing.schedule import ClockedValue, ReceivedSample, Schedule, Tick
 
@@ -243,7 +242,7 @@ def lifted(
     numbers
         The numerical parts of the frame.
     """
-    with single_threaded(), finite_equations(model.origin.topology), np.errstate(all="ignore"):
+    with evaluating(model):
         link = _link_of(model, open_at)
         driven_peers = [
             _open_loop(model, peer_class, "" if link else open_at, numbers) for peer_class in peer_classes

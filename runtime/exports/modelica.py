@@ -96,7 +96,7 @@ def modelica(model: Model) -> ModelicaModel:
     ApcError
         E955 a construct without a Modelica equivalent; E801, E802 an undefined mean.
     """
-    with finite_equations(model.origin.topology):
+    with finite_equations(model):
         return _ModelicaWriter(stamped(model)).complete()
 
 

@@ -36,14 +36,14 @@ from apc.lifting.interval_arithmetic import (
     with_error_radius,
 )
 from apc.lifting.numeric_model import NumericModel, numeric_model
-from apc.linearization.evaluation_errors import finite_equations
+from apc.linearization.evaluation_errors import evaluating
 from apc.mean_square.mean_square_stability import StabilityMeasure
 from apc.network.nominal_criterion import limitations
 from apc.result import Result
 from apc.spectrum.kyp_bounds import least_real, proves_positive
 from apc.spectrum.modes import split
 from apc.support.not_supported import NotSupportedError
-from apc.support.threads import load_pool, single_threaded
+from apc.support.threads import load_pool
 from apc.verdict import NO_PROOF, ProofMethod, ProofScope, StabilityProof, Term
 
 Complexes = NDArray[np.complex128]
@@ -205,7 +205,7 @@ def _one_sided_hand_conditions(
 
     `fixed` is the analysis with its devices clamped.
     """
-    with single_threaded(), finite_equations(numeric.model.origin.topology), np.errstate(all="ignore"):
+    with evaluating(numeric.model):
         loops: tuple[PortLoop, ...] = ()
         unsupported = ""
         try:
@@ -339,7 +339,7 @@ def loop_growths(numeric: NumericModel, *, bounded: bool = True) -> list[Stabili
 
 def _growths_along_line(numeric: NumericModel, *, bounded: bool) -> list[StabilityMeasure]:
     """Return the number of each closed loop of a model without hands whose devices move along a line."""
-    with single_threaded(), finite_equations(numeric.model.origin.topology), np.errstate(all="ignore"):
+    with evaluating(numeric.model):
         reserves, scale = [(-np.inf, -np.inf, -np.inf)], 1.0
         with suppress(NotSupportedError):
             loops = [loop for side in sides(numeric) for loop in port_loops(side.numeric, option=OPTION)]

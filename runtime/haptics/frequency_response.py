@@ -26,11 +26,10 @@ from apc.haptics.device_port import DevicePort, check_frequencies, find_port, ne
 from apc.haptics.peer_responses import AROUND, Responses, device_labels, responses
 from apc.haptics.response_norms import H2Gains, HinfGains, NetworkDamping
 from apc.lifting.numeric_model import NumericModel, numeric_model
-from apc.linearization.evaluation_errors import finite_equations
+from apc.linearization.evaluation_errors import evaluating
 from apc.network.nominal_criterion import limitations
 from apc.result import PlotStyle, Result
 from apc.support.extension_table import find_extension, not_installed, require_extension
-from apc.support.threads import single_threaded
 from apc.verdict import Limitation, LimitationCode
 
 Floats = NDArray[np.float64]
@@ -164,7 +163,7 @@ def transparency(
     verdict = judge(numeric)
     if verdict.stable is False and not unstable:
         raise _unstable_error(model, verdict.spectral_radius)
-    with single_threaded(), finite_equations(model.origin.topology), np.errstate(all="ignore"):
+    with evaluating(model):
         response = responses(numeric, port, other)
         s = np.asarray(2j * np.pi * result, dtype=np.complex128)
         driven, *aliases, transmitted, error = response.steady(s, ALIASES)

@@ -31,12 +31,11 @@ from apc.lifting.start_parameters import (
     with_start_parameters,
     with_start_values,
 )
-from apc.linearization.evaluation_errors import finite_equations
+from apc.linearization.evaluation_errors import evaluating
 from apc.parameter_values.display_units import DisplayUnit, as_shown
 from apc.parameter_values.parameter_names import ParameterRef, parameter_of, times_of
 from apc.parameter_values.parameters import free_rows
 from apc.result import Result
-from apc.support.threads import single_threaded
 
 START, EQUILIBRIUM = "start", "equilibrium"
 OPERATING_POINTS = (START, EQUILIBRIUM)
@@ -178,7 +177,7 @@ def _operating_point(
 ) -> OperatingPoint:
     """Return the equilibrium of `operating_point_from`, cached."""
     extended = with_start_parameters(model)
-    with single_threaded(), finite_equations(model.origin.topology), np.errstate(all="ignore"):
+    with evaluating(model):
         numeric = _at_start(extended)
         classes = classes_of_equals(numeric)
         equations = EquilibriumEquations(numeric, classes, dict(start or ()))

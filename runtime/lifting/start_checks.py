@@ -15,10 +15,9 @@ from apc.compiler.timings import part
 from apc.lifting.data_age import linear_subsystems, of_single_delay
 from apc.lifting.discretize import TOO_LARGE, refuse_many
 from apc.lifting.lift import lift
-from apc.linearization.evaluation_errors import finite_equations
+from apc.linearization.evaluation_errors import evaluating
 from apc.linearization.linearize import check_start, linearize
 from apc.parameter_values.parameters import resolve
-from apc.support.threads import single_threaded
 from apc.timing.scheduling import build_schedules
 
 # Subsystems of a peer type that are checked: they differ in parameter values only.
@@ -45,7 +44,7 @@ def check_values(model: Model) -> None:
     numbers = resolve(model)
     subsystems = linear_subsystems(of_single_delay(model), numbers.timings)
     schedules = build_schedules(model, numbers.timings, [subsystem.pattern for subsystem in subsystems])
-    with single_threaded(), finite_equations(model.origin.topology), np.errstate(all="ignore"):
+    with evaluating(model):
         for group, schedule, rows in zip(model.groups, schedules, numbers.parameters, strict=True):
             if not subsystems[group.peer_type].parameters_suffice:
                 continue

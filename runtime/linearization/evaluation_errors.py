@@ -1,6 +1,7 @@
 """Equations without a finite value, reported as user errors.
 
-Takes: a block of code that evaluates a model's equations. Gives: `finite_equations`, `at_part`, `part_of`.
+Takes: a block of code that evaluates a model's equations. Gives: `finite_equations`, `evaluating`, `at_part`,
+`part_of`.
 Guarantees: a division by zero, a logarithm of a negative number or a loop that Newton's method does not solve
 becomes one `ApcError`; an error without a source file is located in this topology; every other exception
 passes.
@@ -14,9 +15,13 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 
+import numpy as np
+
+from apc.compiler.compiled import Model
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.source.nodes import Mapping
 from apc.compiler.source.source import parse_source
+from apc.support.threads import single_threaded
 
 SOMEWHERE = SourceLocation("the topology")  # of an error in parameters alone
 
@@ -27,19 +32,20 @@ _NO_VALUE = ("math domain error", "rootfinder", "Evaluation failed", "Newton", "
 
 
 @contextmanager
-def finite_equations(topology: str) -> Iterator[None]:
+def finite_equations(model: Model) -> Iterator[None]:
     """Convert exceptions of equations without a finite value into an ApcError.
 
     Parameters
     ----------
-    topology
-        The file of the topology.
+    model
+        The model whose equations are evaluated.
 
     Raises
     ------
     ApcError
         E808 the equations have no finite value, or no solution, at the start values.
     """
+    topology = model.origin.topology
     try:
         yield
     except ApcError as error:
@@ -53,6 +59,15 @@ def finite_equations(topology: str) -> Iterator[None]:
         if any(words in str(error) for words in _NO_VALUE):
             raise _mistake(topology) from error
         raise
+
+
+@contextmanager
+def evaluating(model: Model) -> Iterator[None]:
+    """Evaluate a model with one thread, without floating-point warnings, and with the errors of
+    `finite_equations`.
+    """
+    with single_threaded(), finite_equations(model), np.errstate(all="ignore"):
+        yield
 
 
 def part_of(variable: str) -> str:

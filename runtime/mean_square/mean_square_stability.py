@@ -21,7 +21,7 @@ from apc.analysis.one_sided_slopes import severity, sides
 from apc.compiler.compiled import Link, Model
 from apc.lifting.model_numbers import cached_in_model
 from apc.lifting.numeric_model import NumericModel
-from apc.linearization.evaluation_errors import finite_equations
+from apc.linearization.evaluation_errors import evaluating
 from apc.mean_square.class_moments import (
     Moments,
     PerTickReception,
@@ -39,7 +39,6 @@ from apc.parameter_values.parameters import resolve
 from apc.result import Result
 from apc.support.extension_table import find_extension, not_installed
 from apc.support.not_supported import NotSupportedError
-from apc.support.threads import single_threaded
 from apc.verdict import NO_PROOF, ProofMethod, ProofOutcome, ProofScope, StabilityProof, Term
 
 UNPROVED = "not proved: the growth is from a floating-point iteration"
@@ -308,7 +307,7 @@ def mean_square_stability(numeric: NumericModel, *, certify: bool = False) -> Me
 def _mean_square_stability(numeric: NumericModel, *, certify: bool) -> MeanSquareStability:
     """Return the mean-square stability of a model without kinks."""
     model = numeric.model
-    with single_threaded(), finite_equations(model.origin.topology), np.errstate(all="ignore"):
+    with evaluating(model):
         result = mean_square_growth(numeric)
         lossy_links = [link for link, law in unreliable(model) if law.mean_loss]
         has_worst_case = lossy_links and not any(_other_coupling(model, link) for link in lossy_links)

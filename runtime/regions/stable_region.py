@@ -26,7 +26,7 @@ from apc.compiler.timings import part
 from apc.compiler.wording import counted
 from apc.lifting.devices import replaced_hands
 from apc.lifting.numeric_model import NumericModel, numeric_model
-from apc.linearization.evaluation_errors import finite_equations
+from apc.linearization.evaluation_errors import evaluating
 from apc.network.nominal_criterion import limitations, refuse_channel_number
 from apc.parameter_values.overrides import apply
 from apc.parameter_values.parameter_names import ParameterRef, Range, notes_for_all_groups
@@ -63,7 +63,6 @@ from apc.studies.stability_criteria import (
     verdict_with,
 )
 from apc.studies.timing_values import is_scaled, reaches_period
-from apc.support.threads import single_threaded
 
 if TYPE_CHECKING:
     import pandas
@@ -287,7 +286,7 @@ def region(
         else:
             refuse_timing_parameter(model, parameter_ref, LOCATION, chosen_criterion)
     rectangle = rectangle_of(*axes)
-    with single_threaded(), finite_equations(model.origin.topology), np.errstate(all="ignore"):
+    with evaluating(model):
         kinds = [kind_for_parameter(model, parameter_ref) for parameter_ref in parameter_refs]
         timed = [index for index, kind in enumerate(kinds) if kind is not EvaluatorKind.MATRICES]
         counts = [axes[index] for index in timed if kinds[index] is EvaluatorKind.COUNTS]

@@ -24,7 +24,7 @@ from apc.compiler.compiled import LENGTH, Model
 from apc.compiler.errors import ApcError, Diagnostic, SourceLocation
 from apc.compiler.timings import part
 from apc.lifting.numeric_model import numeric_model
-from apc.linearization.evaluation_errors import finite_equations
+from apc.linearization.evaluation_errors import evaluating
 from apc.mean_square.mean_square_stability import MeanSquareVerdict, mean_square_growth, verdict_of
 from apc.network.nominal_criterion import unreliable
 from apc.result import Result
@@ -44,7 +44,6 @@ from apc.support.processes import (
     results,
     this_process,
 )
-from apc.support.threads import single_threaded
 
 QUANTILES = (0.05, 0.5, 0.95)  # of the motions of all runs that are reported
 SURE = 1.959963984540054  # standard deviations of the two-sided 95 % interval of a normal distribution
@@ -229,7 +228,7 @@ def _mean_square(model: Model) -> MeanSquare | None:
     if not unreliable(model):
         return None
     try:
-        with single_threaded(), finite_equations(model.origin.topology), np.errstate(all="ignore"):
+        with evaluating(model):
             numeric = numeric_model(model)
             result = mean_square_growth(numeric)
     except ApcError as error:  # a model that can't be analysed can still be simulated

@@ -179,7 +179,7 @@ def prepare(
     topology = model
     refuse_unheard_of(model)
     refuse_range(model)
-    with finite_equations(model.origin.topology):
+    with finite_equations(model):
         plan = plan_of(model, settings.method)
         model = plan.model
         choices = _choices(plan, signals)

@@ -369,7 +369,7 @@ def _shared_matrices(
     columns = tuple(column for column in range(len(free)) if column not in times)
     parameter_refs = tuple(free[column] for column in columns)
     try:
-        with finite_equations(numeric.model.origin.topology), np.errstate(all="ignore"):
+        with finite_equations(numeric.model), np.errstate(all="ignore"):
             timed_model = apply(numeric.model, timing_overrides)
             generic_model = numeric.at(generic(timed_model, parameter_refs))
             if not parameters_suffice(generic_model):

@@ -25,7 +25,7 @@ from apc.compiler.wording import with_unit
 from apc.haptics.absolute_stability import absolute_stability
 from apc.lifting.devices import replaced_hands
 from apc.lifting.numeric_model import NumericModel, delay_search_refused, numeric_model
-from apc.linearization.evaluation_errors import finite_equations
+from apc.linearization.evaluation_errors import evaluating
 from apc.network.nominal_criterion import limitations, refuse_channel_number
 from apc.parameter_values.parameter_names import (
     ParameterRef,
@@ -82,7 +82,6 @@ from apc.studies.stability_criteria import (
 from apc.studies.timing_values import MOST_FRAME_TICKS, is_scaled, reaches_period, refuse_phase
 from apc.support.option_value import option_value
 from apc.support.state_limits import SEARCH_STATES
-from apc.support.threads import single_threaded
 from apc.verdict import Sentence, Term
 
 _LOCATION = SourceLocation("critical value")
@@ -223,7 +222,7 @@ def critical(
     by_growth = chosen_criterion in SCALAR_CRITERIA
     if not by_growth:
         refuse_channel_number(model, parameter_ref, _LOCATION, instead=f"--criterion {MEAN_SQUARE}")
-    with single_threaded(), finite_equations(model.origin.topology), np.errstate(all="ignore"):
+    with evaluating(model):
         timed = reaches_time(model, parameter_ref)
         unit = unit_of(model, parameter_ref.name)
         current = value_now(model, parameter_ref)

@@ -28,7 +28,7 @@ from apc.compiler.errors import ApcError, SourceLocation
 from apc.compiler.timings import part
 from apc.compiler.wording import counted
 from apc.lifting.numeric_model import NumericModel
-from apc.linearization.evaluation_errors import finite_equations
+from apc.linearization.evaluation_errors import evaluating
 from apc.network.nominal_criterion import channel_numbers
 from apc.parameter_values.parameter_names import (
     ParameterRef,
@@ -58,7 +58,6 @@ from apc.studies.stability_criteria import (
     scale_of,
 )
 from apc.studies.timing_values import delay_now
-from apc.support.threads import single_threaded
 from apc.verdict import StabilityVerdict
 
 Floats = NDArray[np.float64]
@@ -141,7 +140,7 @@ def margins(numeric: NumericModel, *, quick: bool = False, analysis: Analysis | 
         The analysis at the present values, if already computed.
     """
     model = numeric.model
-    with single_threaded(), finite_equations(model.origin.topology), np.errstate(all="ignore"):
+    with evaluating(model):
         parameter_refs, delays = coupler_parameters(model), _delays(model)
         linearized = evaluator_for(numeric, [*parameter_refs, *delays]).linearized
         # Times do not move an equilibrium, at which a delay then finds one linearization.
@@ -338,12 +337,7 @@ def network_margins(numeric: NumericModel, nominal: Margins, *, quick: bool = Fa
         Whether expensive margins are left out.
     """
     model = numeric.model
-    with (
-        part("margins"),
-        single_threaded(),
-        finite_equations(model.origin.topology),
-        np.errstate(all="ignore"),
-    ):
+    with part("margins"), evaluating(model):
         parameter_refs = [*coupler_parameters(model), *channel_parameters(model)]
         states = max(len(peer_type.states) for peer_type in model.peer_types)
         if quick and len(parameter_refs) * states > MOST_GROWN_IN_PASSING:

@@ -29,7 +29,7 @@ from apc.compiler.errors import ApcError, SourceLocation
 from apc.compiler.timings import part
 from apc.compiler.wording import counted
 from apc.lifting.numeric_model import NumericModel
-from apc.linearization.evaluation_errors import finite_equations
+from apc.linearization.evaluation_errors import evaluating
 from apc.network.nominal_criterion import channel_numbers
 from apc.parameter_values.display_units import DisplayUnit
 from apc.parameter_values.parameter_names import ParameterRef, named_times, parameter_of, unit_of, value_now
@@ -39,7 +39,6 @@ from apc.spectrum.eigenpairs import driving_parts, eigenpairs
 from apc.studies.evaluator import evaluator, free_parameters
 from apc.studies.evaluator_choice import radius_evaluator
 from apc.studies.stability_criteria import MEAN_SQUARE, NOMINAL
-from apc.support.threads import single_threaded
 
 if TYPE_CHECKING:
     from apc.mean_square.mean_square_stability import StabilityMeasure
@@ -126,7 +125,7 @@ def sensitivities(numeric: NumericModel, *, analysis: Analysis | None = None) ->
     A parameter of 0 is varied separately: a mode that is rigid at this value is not rigid when it varies.
     """
     model = numeric.model
-    with single_threaded(), finite_equations(model.origin.topology), np.errstate(all="ignore"):
+    with evaluating(model):
         parameter_refs = varied(model)
         start = prepare_at_start(numeric, parameter_refs)
         now = analysis or analyze(numeric)
@@ -248,12 +247,7 @@ def network_sensitivities(numeric: NumericModel) -> Sensitivities:
         The model with its parameter values.
     """
     model = numeric.model
-    with (
-        part("sensitivities"),
-        single_threaded(),
-        finite_equations(model.origin.topology),
-        np.errstate(all="ignore"),
-    ):
+    with part("sensitivities"), evaluating(model):
         from apc.mean_square.mean_square_stability import (
             mean_square_growth,  # most models have an ideal network
         )

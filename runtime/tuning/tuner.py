@@ -33,7 +33,7 @@ from apc.compiler.errors import ApcError, Diagnostic
 from apc.compiler.timings import part
 from apc.haptics.absolute_stability import absolute_stability
 from apc.lifting.numeric_model import numeric_model
-from apc.linearization.evaluation_errors import finite_equations
+from apc.linearization.evaluation_errors import evaluating
 from apc.network.nominal_criterion import limitations
 from apc.parameter_values.overrides import Override, apply
 from apc.parameter_values.parameter_names import ParameterRef, Range, value_now
@@ -42,7 +42,6 @@ from apc.studies.crossing import Progress
 from apc.studies.stability_criteria import MEAN_SQUARE, NOMINAL, PASSIVE
 from apc.support.extension_table import find_extension, require_extension
 from apc.support.not_supported import NotSupportedError
-from apc.support.threads import single_threaded
 from apc.tuning.constraints import BEYOND, RESPONSES, ConstraintSet, Scenario, transparency_in
 from apc.tuning.scenario_optimizer import BINDS, Optimum, ScenarioOptimizer
 from apc.tuning.specification import CHANGING, CONSTRAINT, HINF, LOCATION, TransparencyMetric, TuningSpec
@@ -217,7 +216,7 @@ def tune(
         The errors of the analyses, such as E898 an unsupported network, and of `transparency`; E996 a
         transparency metric that is undefined everywhere.
     """
-    with single_threaded(), finite_equations(model.origin.topology), np.errstate(all="ignore"):
+    with evaluating(model):
         return _Tuner(model, spec, time.monotonic() + seconds, progress or (lambda _: None)).tuned()
 
 

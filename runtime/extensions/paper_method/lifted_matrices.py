@@ -51,7 +51,7 @@ from apc.lifting.interval_arithmetic import (
 )
 from apc.lifting.lift import FrameMap
 from apc.lifting.numeric_model import numeric_model
-from apc.linearization.evaluation_errors import finite_equations
+from apc.linearization.evaluation_errors import evaluating
 from apc.network.nominal_criterion import limitations
 from apc.result import Result
 from apc.spectrum.interconnection import ClosedLoop, InterconnectionMatrices, StateLayout, interconnect
@@ -60,7 +60,7 @@ from apc.spectrum.peer_classes import PeerClass
 from apc.spectrum.relative_coordinates import relative_bounded, relative_coordinates, relative_indices
 from apc.spectrum.rigid_modes import RigidModes, classify_neutral_modes, find_rigid_modes
 from apc.spectrum.spectrum import Spectrum, solve_spectrum, up_to
-from apc.support.threads import load_pool, single_threaded
+from apc.support.threads import load_pool
 from apc.timing.schedule import CouplingTerm
 from apc.verdict import StabilityVerdict
 
@@ -133,7 +133,7 @@ def paper_method(model: Model) -> PaperMethod:
         E861 a model that is not of the paper's form, with the differences; E862 matrices that would be too
         large; and the errors of an analysis.
     """
-    with single_threaded(), finite_equations(model.origin.topology), np.errstate(all="ignore"):
+    with evaluating(model):
         return _named_matrices(_open_loop(model, dense(*lifted_classes(numeric_model(model)))))
 
 
@@ -153,7 +153,7 @@ def analyze_paper(model: Model) -> Analysis:
     ApcError
         As for `paper_method`; E861 also for a model with a drift.
     """
-    with single_threaded(), finite_equations(model.origin.topology), np.errstate(all="ignore"):
+    with evaluating(model):
         closed_loop = dense(*lifted_classes(numeric_model(model)))
         loop = _open_loop(model, closed_loop)
         rigid = find_rigid_modes(closed_loop)
