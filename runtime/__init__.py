@@ -26,10 +26,10 @@ def __getattr__(name: str) -> Any:
     lookup, _, public = _attached()
     if name == "__all__":
         return public
-    from apc.support.renamed import FUNCTIONS
+    from apc.support.renamed import FORMER_FUNCTIONS
 
-    if name in FUNCTIONS:
-        raise AttributeError(f"unknown function apc.{name}; its present name is apc.{FUNCTIONS[name]}")
+    if name in FORMER_FUNCTIONS:
+        raise AttributeError(f"unknown function apc.{name}; its present name is apc.{FORMER_FUNCTIONS[name]}")
     return lookup(name)
 
 

@@ -129,7 +129,7 @@ class StabilityProof(Sentence):
     def __str__(self) -> str:
         """Return the proof as a text, "" without one."""
         if self.undecided:
-            return f"{self.undecided} between are undecided"
+            return f"{self.undecided} between are undecided"  # numbers of peers between two analyzed ones
         text = str(self.method)
         if self.method is ProofMethod.BALLS:
             at = "at" if self.outcome is ProofOutcome.UNDECIDED else "with"

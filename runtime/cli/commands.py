@@ -12,7 +12,7 @@ import click
 from apc import cli
 from apc.cli.options import echo
 from apc.compiler.errors import nearest
-from apc.support.renamed import COMMANDS
+from apc.support.renamed import FORMER_COMMANDS
 
 CONTEXT = {"help_option_names": ["-h", "--help"], "max_content_width": 80}
 SUFFIX = "_command"  # of the functions that `apc.cli` names
@@ -64,9 +64,9 @@ class CommandGroup(click.Group):
 
         Raises click.UsageError for a former name.
         """
-        if cmd_name in COMMANDS:
+        if cmd_name in FORMER_COMMANDS:
             raise click.UsageError(
-                f"unknown command {cmd_name}; its present name is {COMMANDS[cmd_name]}.", ctx
+                f"unknown command {cmd_name}; its present name is {FORMER_COMMANDS[cmd_name]}.", ctx
             )
         command: click.Command | None = getattr(cli, f"{cmd_name}{SUFFIX}", None)
         return command

@@ -25,7 +25,7 @@ from apc.compiler.number_parsing import plain_int
 from apc.compiler.timings import part, record
 from apc.output.formatting import full_digits, json_text
 from apc.result import Result
-from apc.support.renamed import OPTIONS
+from apc.support.renamed import FORMER_OPTIONS
 from apc.support.threads import start_single_threaded
 
 # Settings of an option by the annotation of its parameter, unless `option` overrides them.
@@ -176,7 +176,7 @@ class Command(click.Command):
         try:
             return super().parse_args(ctx, args)
         except click.NoSuchOption as error:
-            present = (OPTIONS[""] | OPTIONS.get(self.name or "", {})).get(error.option_name)
+            present = (FORMER_OPTIONS[""] | FORMER_OPTIONS.get(self.name or "", {})).get(error.option_name)
             if not any(present in parameter.opts for parameter in self.params):
                 raise
             message = f"unknown option {error.option_name}; its present name is {present}."

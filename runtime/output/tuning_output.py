@@ -74,7 +74,9 @@ def tuning_text(tuning: Tuning) -> Lines:
     if tuning.feasible or tuning.proofs:
         yield ""
     value = uncertain(tuning.optimum, tuning.error, tuning.unit)
-    if _is_transparency(tuning) or math.isinf(tuning.error):  # nobody knows how far any better one may be
+    if _is_transparency(tuning) or math.isinf(
+        tuning.error
+    ):  # the distance to a better optimum is unknown: no error is printed
         value = quantity(tuning.optimum, tuning.unit, SHADOW_PRICES + 1)
     of = f"{_radius(tuning)} " if tuning.objective in (RADIUS, SETTLING) else ""
     better = f"within {100 * float(OPTIMALITY_GAP):.3g} % of the global optimum"

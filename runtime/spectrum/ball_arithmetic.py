@@ -95,7 +95,9 @@ def frame_steps(
     schedule: Schedule,
     step: Callable[[Balls, Balls, Fraction], Balls] = step_balls,
 ) -> Steps:
-    """Return a subsystem's exponentials [F G] by duration in quanta, at the current precision."""
+    """Return the matrix [F G] of each duration in quanta by `step`: by default its exponential in balls, at
+    the current precision.
+    """
     durations = {event.duration for event in schedule.events if isinstance(event, Propagate)}
     return {
         duration: step(subsystem.a, subsystem.b, duration * schedule.quantum)

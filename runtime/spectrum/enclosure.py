@@ -118,6 +118,7 @@ def enclose_stack(matrix: Matrix, error: Floats) -> tuple[Eigenpairs, Enclosure]
         pairs = Eigenpairs(values, right, inverses(right))
         bounds = _bounds(matrix, error, pairs, pairs.left, values)
         width = bounds.high - bounds.low
+        # Wide bounds, as near a multiple eigenvalue, are computed again with an invariant subspace.
         for row in np.flatnonzero(~(width <= SHARP * np.maximum(bounds.low, 1.0))).tolist():
             repeated, tighter = _enclose_with_subspace(matrix[row : row + 1], error[row : row + 1])
             values[row], right[row], pairs.left[row] = repeated.values[0], repeated.right[0], repeated.left[0]

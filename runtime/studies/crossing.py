@@ -424,7 +424,10 @@ def _scan_segment(segment: SmoothSegment, *, first: bool) -> tuple[_Samples, boo
 
 
 def _first_samples(segment: SmoothSegment, *, first: bool) -> tuple[_Samples, str]:
-    """Return the samples at the first points, as far as required, and the reason of an early end."""
+    """Return the samples at a segment's points, and the message of an error that ended them.
+
+    For the first crossing of a slow segment, `first`, points are sampled up to the first bracket only.
+    """
     if not (first and segment.slow):
         return _samples_at(segment, segment.points), ""
     samples = _samples_at(segment, segment.points[:1])

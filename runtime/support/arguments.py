@@ -19,7 +19,7 @@ from types import UnionType
 from typing import Any, Literal, ParamSpec, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from apc.compiler.compiled import Model
-from apc.support.renamed import ARGUMENTS
+from apc.support.renamed import FORMER_ARGUMENTS
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -50,7 +50,7 @@ def checked(function: Callable[P, T]) -> Callable[P, T]:
         try:
             bound = signature.bind(*args, **kwargs)
         except TypeError as error:
-            former = ARGUMENTS[""] | ARGUMENTS.get(function.__name__, {})
+            former = FORMER_ARGUMENTS[""] | FORMER_ARGUMENTS.get(function.__name__, {})
             renamed = [
                 f"unknown argument {name}=; its present name is {former[name]}="
                 for name in kwargs

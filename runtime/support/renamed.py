@@ -1,6 +1,6 @@
 """Former public names, and the names that replace them: for the messages of one release.
 
-Takes: nothing. Gives: `COMMANDS`, `OPTIONS`, `FUNCTIONS`, `ARGUMENTS`.
+Takes: nothing. Gives: `FORMER_COMMANDS`, `FORMER_OPTIONS`, `FORMER_FUNCTIONS`, `FORMER_ARGUMENTS`.
 Guarantees: a former name raises an error with its replacement.
 Does not: rename keys of a topology (see `compiler.source.reading`).
 """
@@ -9,10 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-COMMANDS: Mapping[str, str] = {"feel": "transparency", "play": "run"}
+# The present name of each former command.
+FORMER_COMMANDS: Mapping[str, str] = {"feel": "transparency", "play": "run"}
 
 # Former options by command; "" for all commands.
-OPTIONS: Mapping[str, dict[str, str]] = {
+FORMER_OPTIONS: Mapping[str, dict[str, str]] = {
     "": {"--in": "--criterion"},
     "analyze": {"--buzz": "--limit-cycle", "--conventions": "--event-order"},
     "export": {"--cut": "--open-at", "--free": "--symbolic"},
@@ -20,7 +21,7 @@ OPTIONS: Mapping[str, dict[str, str]] = {
     "tune": {"--subject": "--constraint", "--against": "--tradeoff"},
 }
 
-FUNCTIONS: Mapping[str, str] = {
+FORMER_FUNCTIONS: Mapping[str, str] = {
     "buzz": "limit_cycle",
     "conventions": "event_order",
     "describe_network": "fit_link",
@@ -46,7 +47,7 @@ FUNCTIONS: Mapping[str, str] = {
 }
 
 # Former arguments by function; "" for all functions.
-ARGUMENTS: Mapping[str, dict[str, str]] = {
+FORMER_ARGUMENTS: Mapping[str, dict[str, str]] = {
     "": {"set": "params"},
     "export": {"cut": "open_at", "free": "symbolic"},
     "simulate": {"strike": "impulse"},

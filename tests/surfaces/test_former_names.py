@@ -9,12 +9,12 @@ import pytest
 import apc
 from apc import cli
 from apc.compiler.source.reading import RENAMED
-from apc.support.renamed import ARGUMENTS, COMMANDS, FUNCTIONS, OPTIONS
+from apc.support.renamed import FORMER_ARGUMENTS, FORMER_COMMANDS, FORMER_FUNCTIONS, FORMER_OPTIONS
 from apc.tuning.specification import FORMER, TRANSPARENCY
 from tests.commands import Cli
 from tests.topologies import AVERAGE, replaced
 
-EVERY = [(command, old, new) for command, pairs in OPTIONS.items() for old, new in pairs.items()]
+EVERY = [(command, old, new) for command, pairs in FORMER_OPTIONS.items() for old, new in pairs.items()]
 
 
 @pytest.fixture
@@ -24,13 +24,13 @@ def topology(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     return "t.yaml"
 
 
-@pytest.mark.parametrize("old", COMMANDS)
+@pytest.mark.parametrize("old", FORMER_COMMANDS)
 def test_a_former_command_names_the_present_one(old: str, topology: str, cli: Cli) -> None:
     ran = cli(old, topology)
     assert ran.code == 2 and ran.err.strip().endswith(
-        f"Error: unknown command {old}; its present name is {COMMANDS[old]}."
+        f"Error: unknown command {old}; its present name is {FORMER_COMMANDS[old]}."
     )
-    assert cli(COMMANDS[old], "--help").code == 0
+    assert cli(FORMER_COMMANDS[old], "--help").code == 0
 
 
 @pytest.mark.parametrize(("command", "old", "new"), EVERY)
@@ -46,7 +46,7 @@ def test_a_former_option_names_the_present_one(
 
 @pytest.mark.needs_extension("all")
 def test_a_former_function_names_the_present_one() -> None:
-    for old, new in FUNCTIONS.items():
+    for old, new in FORMER_FUNCTIONS.items():
         with pytest.raises(
             AttributeError, match=rf"^unknown function apc\.{old}; its present name is apc\.{new}$"
         ):
@@ -56,7 +56,7 @@ def test_a_former_function_names_the_present_one() -> None:
 
 def test_a_former_argument_names_the_present_one(topology: str) -> None:
     calls = {"": apc.analyze, "export": apc.export, "simulate": apc.simulate, "tune": apc.tune}
-    for function, pairs in ARGUMENTS.items():
+    for function, pairs in FORMER_ARGUMENTS.items():
         for old, new in pairs.items():
             call = calls.get(function, apc.pareto_front)
             with pytest.raises(
@@ -119,4 +119,4 @@ def test_a_former_key_names_the_present_one(old: str, topology: str, cli: Cli) -
 
 def test_no_former_name_is_a_present_one() -> None:
     names = {name.removesuffix("_command") for name in dir(cli)}
-    assert not COMMANDS.keys() & names and set(COMMANDS.values()) <= names
+    assert not FORMER_COMMANDS.keys() & names and set(FORMER_COMMANDS.values()) <= names

@@ -244,7 +244,7 @@ def _period_growth(
             product = MIDPOINT_RADIUS.multiply(frame_maps[numbers], halves[-1])
             halves[-1], exponent = _scaled(product, float(np.abs(value_of(product)).max(initial=0.0)))
             scale += exponent
-    first, last = (halves * 2)[:2]
+    first, last = halves[0], halves[-1]
     product, reordered = last, value_of(last)
     if frames > 1:
         product, reordered = MIDPOINT_RADIUS.multiply(last, first), value_of(first) @ value_of(last)

@@ -67,7 +67,7 @@ NODE_ROUNDINGS = 16
 class Receiver:
     """The dynamics of a peer of a class by the number of received packets.
 
-    Each row of `received` (m, K) has probability `weight`.
+    Each row of `received` (m, K) has the probability `probabilities` (m,).
 
     `local_map` is P(a) (m, 2, n, n), `mean` its mean,
     `received_from` K_g(a) for each class g (m, 2, n, n_g), and
@@ -75,7 +75,7 @@ class Receiver:
     """
 
     received: Floats
-    weight: Floats
+    probabilities: Floats
     local_map: Matrix
     mean: Matrix
     received_from: tuple[Matrix, ...]
@@ -189,26 +189,29 @@ def receivers_of(
     receivers = []
     for h, rows in enumerate(reception.of(common)):
         others = [count - (g == h) for g, count in enumerate(counts)]
-        class_weights = {coupling_term: weight[h] for coupling_term, weight in weights.items()}
+        class_weights = {coupling_term: rows_of[h] for coupling_term, rows_of in weights.items()}
         ticks = len({(row.clock, row.tick) for row in rows})
-        nodes = [
+        # The number of packets received from each class is binomial; its moments are integrated exactly.
+        packet_counts = [
             quadrature(n, law.mean_loss, ticks + 3)
-            if any(listed[g] for listed in class_weights.values())
+            if any(row[g] for row in class_weights.values())
             else (np.zeros(1), np.ones(1))
             for g, n in enumerate(others)
         ]
-        combinations = math.prod(len(listed) for listed, _ in nodes)
+        combinations = math.prod(len(values_of) for values_of, _ in packet_counts)
         if combinations > MOST_NODES:
             raise NotSupportedError(
                 f"substituted values between different peers: {combinations:,} reception "
                 f"patterns; the limit is {MOST_NODES:,}"
             )
-        received = np.array(list(itertools.product(*(listed for listed, _ in nodes))))
-        weight = np.array(
-            [math.prod(listed) for listed in itertools.product(*(shares for _, shares in nodes))]
+        received = np.array(list(itertools.product(*(values_of for values_of, _ in packet_counts))))
+        probabilities = np.array(
+            [*map(math.prod, itertools.product(*(shares for _, shares in packet_counts)))]
         )
         receivers.append(
-            _closed_receiver(subsystems[h], rows, memory, values, class_weights, others, received, weight)
+            _closed_receiver(
+                subsystems[h], rows, memory, values, class_weights, others, received, probabilities
+            )
         )
     offsets = np.cumsum([0] + [subsystem.states for subsystem in subsystems]).tolist()
     return receivers, offsets, law
@@ -222,7 +225,7 @@ def _closed_receiver(
     weights: Mapping[CouplingTerm, Sequence[Fraction]],
     others: Sequence[int],
     received: Floats,
-    weight: Floats,
+    probabilities: Floats,
 ) -> Receiver:
     """Return a peer's dynamics, with its loop closed through the substitutes for missing values.
 
@@ -238,7 +241,7 @@ def _closed_receiver(
         The coupling weights of a peer of each class, by coupling term.
     others
         The number of other peers of each class.
-    received, weight
+    received, probabilities
         The combinations of received counts per class (m, K), and their probabilities (m,).
     """
     received_now = sorted(set(stored.memory.received.values()))
@@ -278,10 +281,10 @@ def _closed_receiver(
     ]
     shares = []
     for g, sender_matrix in enumerate(received_by):
-        shared = weighted_sum(weight, entrywise(sender_matrix, _rounded_counts(received[:, g])))
+        shared = weighted_sum(probabilities, entrywise(sender_matrix, _rounded_counts(received[:, g])))
         shares.append(entrywise(shared, rounded_number(1 / max(others[g], 1))))
-    mean = weighted_sum(weight, local_map)
-    return Receiver(received, weight, local_map, mean, tuple(received_by), tuple(shares))
+    mean = weighted_sum(probabilities, local_map)
+    return Receiver(received, probabilities, local_map, mean, tuple(received_by), tuple(shares))
 
 
 def _mean_matrix(
@@ -359,7 +362,7 @@ def _deviations(
             if subsystem == index:
                 transition[..., columns] = MIDPOINT_RADIUS.add(transition[..., columns], receiver.local_map)
         yield (
-            receiver.weight * outcome_probability,
+            receiver.probabilities * outcome_probability,
             MIDPOINT_RADIUS.subtract(transition, mean[:, starts[index] : starts[index + 1]]),
         )
 
