@@ -249,16 +249,17 @@ def _thresholds() -> Iterator[str]:
     yield from ("# Thresholds", "")
     yield "The numeric constants of core, studies and extensions, each with its reason, from the sources."
     yield "The largest numbers of states are those of `support.state_limits`."
-    yield "The test is one that fails where the value is ten times larger or smaller; limits of work,"
-    yield "sizes, caches, and bounds that any smaller number would serve have none"
-    yield "(`python -m tests.mutants.thresholds`)."
+    yield "The test is one that fails where the value is ten times larger or smaller, found among the quick tests"
+    yield "that use it (`python -m tests.mutants.thresholds`); a dash is a constant that none of them fixes, such as a"
+    yield "limit of work or of size, and an empty cell one that was not tried."
     tests = json.loads(TESTS_OF_THRESHOLDS.read_text(encoding="utf-8"))
     for package in DECIDING:
         rows = []
         for path in sorted((ROOT / "runtime" / package).rglob("*.py")):
             for names, value, reason in constants(path):
-                file, _, test = tests.get(threshold_key(path, names), "").rpartition("::")
-                shown = f"`{test}` in `{file.removeprefix('tests/')}`" if test else ""
+                found = tests.get(threshold_key(path, names))
+                file, _, test = (found or "").rpartition("::")
+                shown = f"`{test}` in `{file.removeprefix('tests/')}`" if test else "–" if found == "" else ""
                 rows.append(f"| `{names}` | {value} | `{path.stem}` | {reason} | {shown} |")
         yield from (
             "",
