@@ -250,8 +250,8 @@ def _thresholds() -> Iterator[str]:
     yield "The numeric constants of core, studies and extensions, each with its reason, from the sources."
     yield "The largest numbers of states are those of `support.state_limits`."
     yield "The test is one that fails where the value is ten times larger or smaller, found among the quick"
-    yield "tests that use it (`python -m tests.mutants.thresholds`). A dash is a constant that none of them fixes,"
-    yield "such as a limit of work or of size; an empty cell is one that was not tried."
+    yield "tests that use it (`python -m tests.mutants.thresholds`). A dash is a constant that none of them"
+    yield "fixes, such as a limit of work or of size; an empty cell is one that was not tried."
     tests = json.loads(TESTS_OF_THRESHOLDS.read_text(encoding="utf-8"))
     for package in DECIDING:
         rows = []
