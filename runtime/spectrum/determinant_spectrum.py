@@ -188,6 +188,8 @@ def _loop_starts(function: Characteristic) -> Complexes:
     loop_gain = (
         np.eye(function.transfer.shape[0]) - matrices_in(function, on_circle, np.zeros(len(rotations)))[:, 0]
     )
+    finite = np.isfinite(loop_gain).all(axis=(1, 2))  # where a frame grows by many decades, it overflows
+    loop_gain, rotations, on_circle = loop_gain[finite], rotations[finite], on_circle[finite]
     gain = np.linalg.eigvals(loop_gain) * (on_circle**delay)[:, None]
     with np.errstate(divide="ignore", invalid="ignore"):
         logarithm = (np.log(gain) + 2j * np.pi * rotations[:, None]) / delay
@@ -209,7 +211,9 @@ def _common_starts(members: Sequence[TransferMember]) -> Complexes:
         copies = close_self_feedback(
             frame_map, member.schedule, member.total_weights, 0 * member.total_weights
         )
-        values = np.linalg.eigvals(value_of(copies.p)).astype(np.complex128).ravel()
+        matrices = value_of(copies.p)
+        matrices = matrices[np.isfinite(matrices).all(axis=(1, 2))]
+        values = np.linalg.eigvals(matrices).astype(np.complex128).ravel()
         is_start = (values.imag >= 0) & (np.abs(values) > LEAST_START) & (np.abs(values - 1) > SAME_START)
         result.append(values[is_start])
     return np.concatenate(result)

@@ -23,7 +23,7 @@ from apc.spectrum.eigenpairs import (
 )
 from tests.bruteforce import TopologySource, frame_matrices, frame_matrix
 from tests.pairing import apart, arcs_of
-from tests.topologies import AVERAGE, compiled, replaced
+from tests.topologies import AVERAGE, ROOT, compiled, replaced
 from tests.truths import text_of
 
 MS = Fraction(1, 1000)
@@ -300,3 +300,18 @@ def test_a_matrix_of_no_states_has_no_eigenvalues() -> None:
     assert largest_magnitudes(batch).tolist() == [0, 0]
     assert inverses(empty).size == 0
     assert components(empty.astype(bool)) == driving_parts(empty.astype(bool)) == []
+
+
+def test_a_determinant_that_overflows_is_refused_and_the_matrices_decide() -> None:
+    """A frame of the loop of 40 frames of delay grows by many decades at points beside the circle."""
+    values = {
+        "contact.damping": "0.3323 N*s/m",
+        "coordination.stiffness": "10290 N/m",
+        "coordination.damping": "0.712 N*s/m",
+        "contact.delay": "320 ms",
+        "coordination.delay": "16 ms",
+    }
+    model = apc.set_parameters(apc.compile(ROOT / "models" / "topologies" / "experiment-mesh.yaml"), values)
+    with pytest.raises(ApcError, match="E850 method determinant does not apply"):
+        apc.analyze(model, method="determinant")
+    assert apc.analyze(model).stable is False
