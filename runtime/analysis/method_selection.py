@@ -132,64 +132,67 @@ def make_plan(numeric: NumericModel, method: str = "auto") -> AnalysisPlan:
         raise ApcError(
             Diagnostic("E804", SourceLocation(comm_graph.topology), message, fix=f"count: {LARGEST_RING}")
         )
+    loops, chosen_method, notes = _loops_by_method(model, peer_classes, comm_graph, method)
+    _refuse_large(comm_graph, loops, chosen_method, auto=method == "auto")
+    return AnalysisPlan(chosen_method, peer_classes, loops, _sizes(loops, chosen_method), notes)
+
+
+def _loops_by_method(
+    model: Model, peer_classes: Sequence[PeerClass], comm_graph: CommunicationGraph, method: str
+) -> tuple[tuple[ModalSystem, ...], str, tuple[str, ...]]:
+    """Return the modal systems, the method, and the notes on its choice. Raises ApcError E850."""
     if method == "dense":
         refuse_dense(peer_classes, comm_graph)
-        loops: tuple[ModalSystem, ...] = (dense_loop(peer_classes, comm_graph),)
-        chosen_method, notes = "dense", tuple[str, ...]()
-    else:
-        decomposed = decompose(peer_classes, comm_graph)
-        if method == "modes" and decomposed.method != "modes":
-            raise cannot_serve(model, method, decomposed.notes[0])
-        loops, chosen_method, notes = decomposed.loops, decomposed.method, decomposed.notes
-        packets = max(
-            sum(sum(peer_class.schedule.depths) for peer_class in modal_system.peer_classes)
-            for modal_system in loops
-        )
-        stored_outputs = max(
-            sum(len(peer_class.schedule.discrete_states) for peer_class in modal_system.peer_classes)
-            for modal_system in loops
-        )
-        if method == "determinant":
-            chosen_method = method
-        elif method == "auto" and (
-            any(
-                _long_lines(peer_class.schedule)
-                for modal_system in loops
-                for peer_class in modal_system.peer_classes
-            )
-            or (
-                packets + stored_outputs > LONG_LINES
-                and max(modal_system.states for modal_system in loops) > MATRIX_STATES
-            )
-        ):
-            chosen_method = "determinant"
-            in_flight = f"{packets:,} packets in transit are not states"
-            notes = (*notes, in_flight if packets > LONG_LINES else "a single matrix is too large")
-    if chosen_method != "determinant":
-        for modal_system in loops:
-            if modal_system.states > MATRIX_STATES:
-                raise too_large(
-                    comm_graph, f"{comm_graph.peers:,} peers", modal_system.states, auto=method == "auto"
-                )
-        needed_bytes = (
-            CACHE_SIZE * sum(modal_system.states**2 for modal_system in loops)
-            + AT_WORK * max(modal_system.states for modal_system in loops) ** 2
-        )
-        message = (
-            f"{len(loops):,} systems of up to {max(modal_system.states for modal_system in loops):,} states"
-        )
-    else:
+        return (dense_loop(peer_classes, comm_graph),), "dense", ()
+    decomposed = decompose(peer_classes, comm_graph)
+    if method == "modes" and decomposed.method != "modes":
+        raise cannot_serve(model, method, decomposed.notes[0])
+    if method == "determinant":
+        return decomposed.loops, method, decomposed.notes
+    reason = _reason_for_determinant(decomposed.loops) if method == "auto" else ""
+    if reason:
+        return decomposed.loops, "determinant", (*decomposed.notes, reason)
+    return decomposed.loops, decomposed.method, decomposed.notes
+
+
+def _reason_for_determinant(loops: Sequence[ModalSystem]) -> str:
+    """Return why the determinant is faster than matrices, "" if it is not."""
+    packets = max(
+        sum(sum(peer_class.schedule.depths) for peer_class in modal_system.peer_classes)
+        for modal_system in loops
+    )
+    stored_outputs = max(
+        sum(len(peer_class.schedule.discrete_states) for peer_class in modal_system.peer_classes)
+        for modal_system in loops
+    )
+    many_packets = any(
+        _long_lines(peer_class.schedule) for modal_system in loops for peer_class in modal_system.peer_classes
+    )
+    too_many_states = max(modal_system.states for modal_system in loops) > MATRIX_STATES
+    if not many_packets and not (packets + stored_outputs > LONG_LINES and too_many_states):
+        return ""
+    in_flight = f"{packets:,} packets in transit are not states"
+    return in_flight if packets > LONG_LINES else "a single matrix is too large"
+
+
+def _refuse_large(
+    comm_graph: CommunicationGraph, loops: Sequence[ModalSystem], method: str, *, auto: bool
+) -> None:
+    """Raise ApcError E804 for modal systems that are too large for a method, or for the memory."""
+    largest = max(modal_system.states for modal_system in loops)
+    if method == "determinant":
         needed_bytes = sum(_determinant_memory(modal_system) for modal_system in loops)
         subsystems = sum(len(modal_system.peer_classes) for modal_system in loops)
         message = f"{len(loops):,} determinants of {subsystems:,} different peers"
-    refuse_beyond(
-        needed_bytes,
-        "E804",
-        SourceLocation(comm_graph.topology),
-        message,
-        "reduce the number of different peers or of states",
-    )
-    return AnalysisPlan(chosen_method, peer_classes, loops, _sizes(loops, chosen_method), notes)
+    else:
+        if largest > MATRIX_STATES:
+            first = next(modal_system.states for modal_system in loops if modal_system.states > MATRIX_STATES)
+            raise too_large(comm_graph, f"{comm_graph.peers:,} peers", first, auto=auto)
+        needed_bytes = CACHE_SIZE * sum(modal_system.states**2 for modal_system in loops)
+        needed_bytes += AT_WORK * largest**2
+        message = f"{len(loops):,} systems of up to {largest:,} states"
+    advice = "reduce the number of different peers or of states"
+    refuse_beyond(needed_bytes, "E804", SourceLocation(comm_graph.topology), message, advice)
 
 
 def _long_lines(schedule: Schedule) -> bool:
