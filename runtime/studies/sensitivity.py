@@ -160,7 +160,7 @@ def sensitivities(numeric: NumericModel, *, analysis: Analysis | None = None) ->
         ]
         rows: list[Sensitivity] = []
         clusters: list[_Cluster] = []
-        notes, excluded = [], [parameter_ref.label for parameter_ref in breaking]
+        excluded = [parameter_ref.label for parameter_ref in breaking]
         for parameters in parameter_sets:
             parameter_clusters = clusters_of(*parameters)
             if (
@@ -180,13 +180,34 @@ def sensitivities(numeric: NumericModel, *, analysis: Analysis | None = None) ->
                     else:
                         excluded.append(parameter.label)
                 first_rank += len(cluster.values)
+    return _sensitivities_of(rows, clusters, excluded, has_parameters=bool(parameter_refs))
+
+
+def _sensitivities_of(
+    rows: Sequence[Sensitivity],
+    clusters: Sequence[_Cluster],
+    excluded: Sequence[str],
+    *,
+    has_parameters: bool,
+) -> Sensitivities:
+    """Return the sensitivities in order, with the active eigenvalues and the notes.
+
+    Parameters
+    ----------
+    rows, clusters
+        The sensitivities, and the dominant eigenvalues.
+    excluded
+        The labels of parameters on which excluded modes depend.
+    has_parameters
+        Whether there is a parameter to vary.
+    """
     radius = max((float(np.abs(cluster.values).max()) for cluster in clusters), default=0.0)
     if not clusters:
         return Sensitivities(0.0, (), (), "the topology has no motion, so there is no eigenvalue")
     if not radius:  # e^(λT) underflows
         note = "no parameter has an effect: all motions decay to 0 within a frame"
         return Sensitivities(0.0, (), (), note)
-    notes += [_defective_note(cluster) for cluster in clusters if not cluster.condition < WORST]
+    notes = [_defective_note(cluster) for cluster in clusters if not cluster.condition < WORST]
     active = tuple(
         (complex(value), cluster.name)
         for cluster in clusters
@@ -199,9 +220,9 @@ def sensitivities(numeric: NumericModel, *, analysis: Analysis | None = None) ->
         names = ", ".join(dict.fromkeys(excluded))
         notes.append(f"the excluded modes depend on {names}, so their sensitivities are not computed")
     if not rows and not notes:
-        why = "no derivative is finite" if parameter_refs else "there is no parameter to vary"
+        why = "no derivative is finite" if has_parameters else "there is no parameter to vary"
         notes.append(f"sensitivities unknown: {why}")
-    rows.sort(key=lambda row: (-abs(row.relative), row.parameter, row.mode))
+    rows = sorted(rows, key=lambda row: (-abs(row.relative), row.parameter, row.mode))
     return Sensitivities(radius, active, tuple(rows), "; ".join(notes))
 
 
