@@ -45,7 +45,7 @@ WIDEST = 1e-3
 OUTSIDE, TRIES = 8.0, 10
 
 # A circle between the largest zero and the next is counted if their distance is this multiple of the error.
-APART = 100.0
+SEPARATION = 100.0
 
 # The ratio of the radius of a circle about a zero to the zero's error: then few arcs suffice.
 CLEAR = 6.0
@@ -402,7 +402,7 @@ def _bound_of_single_zero(
     middle, (error, inside) = (abs(largest) + following) / 2, disc_of(largest)
     is_real = not largest.imag
     if (
-        not abs(largest) - following > APART * error
+        not abs(largest) - following > SEPARATION * error
         or not (is_real or abs(largest.imag) > error)
         or middle <= function.innermost * INMOST
         or (rigid and (abs(middle - 1) <= rigid_radius or abs(largest - 1) <= rigid_radius + error))

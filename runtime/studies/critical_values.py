@@ -27,6 +27,7 @@ from apc.lifting.devices import replaced_hands
 from apc.lifting.numeric_model import NumericModel, delay_search_refused, numeric_model
 from apc.linearization.evaluation_errors import evaluating
 from apc.network.nominal_criterion import limitations, refuse_channel_number
+from apc.parameter_values.display_units import as_shown
 from apc.parameter_values.parameter_names import (
     ParameterRef,
     find,
@@ -292,7 +293,8 @@ def _ranges_of_long_frames(
     unit = str(unit_of(model, parameter_ref.name))
     for begin, end in ((low, first), (last, high)):
         if begin is not None and end is not None and float(begin) < float(end):
-            span = " to ".join(with_unit(f"{float(value):g}", unit) for value in (begin, end))
+            factor, shown = as_shown(float(end), unit)
+            span = with_unit(f"{float(begin) * factor:.6g} to {float(end) * factor:.6g}", shown)
             yield f"{span} not searched: no value tried there has a frame of at most {MOST_FRAME_TICKS} ticks"
 
 

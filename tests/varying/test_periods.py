@@ -202,4 +202,4 @@ def test_a_range_of_periods_without_short_frames_is_said() -> None:
     whole = apc.critical(model, "slow.period", lower="10 ms", upper="100 ms")
     assert not any("not searched" in text for text in whole.limitations)
     cut = apc.critical(model, "slow.period", lower="10 ms", upper="5 s")
-    assert cut.searched_to[1] < 5 and any("5 s not searched" in text for text in cut.limitations)
+    assert cut.searched_to[1] < 5 and any("to 5 s not searched" in text for text in cut.limitations)
