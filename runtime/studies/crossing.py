@@ -67,8 +67,8 @@ NEWTON, BRENT, HALVINGS = 12, 200, 60
 INWARDS = 1e-9
 
 # The logarithm of a spectral radius that is clearly off the circle: an analysis decides it without matrices.
-# The multiple of its error from the crossing at which verdicts are decided: at 1.03 the errors of the two ends,
-# which differ by some percent, leave one of them undecided.
+# The multiple of its error from the crossing at which verdicts are decided: at 1.03 the errors of both ends,
+# which differ by some percent, leave one undecided.
 AWAY, CLEARLY = 1e-9, 1.1
 
 # The radius is discontinuous in a bracket narrower than this, relative to the value, if it changes by more
