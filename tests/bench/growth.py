@@ -19,7 +19,7 @@ from apc.output.pictures import COLOURS, write_figure
 from tests.bench.judge import Judge, parser_of
 
 TOPOLOGIES = Path(__file__).resolve().parents[2] / "models" / "topologies"
-EQUAL, UNLIKE = (3, 1_000, 1_000_000), (10, 100, 1_000)
+EQUAL, DIFFERENT = (3, 1_000, 1_000_000), (10, 100, 1_000)
 FRAMES, POINTS = (1, 10, 100, 300, 1_000), (100, 1_000, 10_000, 100_000)
 RUNS = 5
 MOST_RATIO = 2.0
@@ -45,11 +45,11 @@ def curves(runs: int, sizes: Mapping[str, Sequence[int]]) -> dict[str, Curve]:
     def equal(count: int) -> Callable[[], object]:
         return lambda: apc.analyze(average, params={"user.count": count})
 
-    def unlike(count: int) -> Callable[[], object]:
+    def different(count: int) -> Callable[[], object]:
         masses = ", ".join(f"{0.05 + 0.1 * value:.6f} kg" for value in generator.random(count))
         text = (TOPOLOGIES / "three-users-average.yaml").read_text(encoding="utf-8")
         assert "user: {count: 3}" in text
-        file = Path(f"unlike-{count}.yaml")
+        file = Path(f"different-{count}.yaml")
         file.write_text(text.replace("user: {count: 3}", f"user: {{set: {{device.mass: [{masses}]}}}}"))
         model = apc.compile(file)
         file.unlink()
@@ -66,7 +66,7 @@ def curves(runs: int, sizes: Mapping[str, Sequence[int]]) -> dict[str, Curve]:
 
     questions = {
         "equal peers": equal,
-        "unlike peers": unlike,
+        "different peers": different,
         "frames of delay": delayed,
         "points": points,
     }
@@ -97,7 +97,7 @@ def main() -> None:
     parser = parser_of("growth", __doc__)
     parser.add_argument("--out", type=Path, help="draw it into this file: .svg, .png or .pdf")
     given = parser.parse_args()
-    sizes = {"equal peers": EQUAL, "unlike peers": UNLIKE, "frames of delay": FRAMES, "points": POINTS}
+    sizes = {"equal peers": EQUAL, "different peers": DIFFERENT, "frames of delay": FRAMES, "points": POINTS}
     if given.quick:
         sizes = {name: listed[:-1] for name, listed in sizes.items()}
     found, judge = curves(1 if given.quick else RUNS, sizes), Judge(given.strict)

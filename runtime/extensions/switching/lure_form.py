@@ -197,11 +197,11 @@ def lure_plants(numeric: NumericModel) -> list[LurePlant]:
     loops = orthogonal_loops([item.peer_class for item in cut_classes], numeric.comm_graph, LURE_STATES)
     result = []
     for modal_system in loops:
-        cut_of_system = [cut_of_class[peer_class.index] for peer_class in modal_system.peer_classes]
-        size = modal_system.states + sum(len(cut.ticks) for cut in cut_of_system)
+        cuts = [cut_of_class[peer_class.index] for peer_class in modal_system.peer_classes]
+        size = modal_system.states + sum(len(cut.ticks) for cut in cuts)
         if size > LURE_STATES:
             raise NotSupportedError(f"{size:,} coupled states and contact ticks; the limit is {LURE_STATES}")
-        result.append(_lure_plant(modal_system, cut_of_system))
+        result.append(_lure_plant(modal_system, cuts))
     return result
 
 
