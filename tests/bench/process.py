@@ -25,7 +25,8 @@ from tests.bench.judge import Judge, elapsed, parser_of
 TOPOLOGIES = Path(__file__).resolve().parents[2] / "models" / "topologies"
 RUNS = 5
 TOPOLOGY, LOSSY = "three-users-average", "lossy-average"
-# Topologies that are made here: a line of 100 packets between two different devices, and 200 different groups.
+# Topologies that are made here: a line of 100 packets between two different devices, and 200 different
+# groups.
 LINE, GROUPS = "line", "groups"
 GAINS = "contact.stiffness=10%N/m:3000%N/m", "coordination.stiffness=10%N/m:3000%N/m"
 REGION = f"-m apc region --json --x {GAINS[0]} --y {GAINS[1]}"
